@@ -32,8 +32,8 @@ from mcc_jax.dem import (
     die,
     half_contact,
     list_edges,
-    listed,
     pair_force,
+    rebuild_list,
     relative_density,
     replay,
     scattered,
@@ -165,7 +165,7 @@ def reverse(count=1000, steps=200):
     packing, state = pressed(count)
     motion = motion_of(packing)
     velocity = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -SPEED], [0.0, 0.0, 0.0]])
-    tape, state = [], listed(packing, state, 4e-6)
+    tape, state = [], rebuild_list(packing, state, 4e-6)
     advance(packing, motion, state, velocity, 1, steps, 4e-6, tape=tape)
     state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, jnp.asarray(velocity)))
 

@@ -36,10 +36,10 @@ def _running_max_jvp(primals, tangents):
     if isinstance(tangent, SymbolicZero):
         return highest, tangent
     first = jnp.ones_like(path[:1], bool)
-    return highest, held(tangent, jnp.concatenate([first, path[1:] > highest[:-1]]))
+    return highest, forward_fill(tangent, jnp.concatenate([first, path[1:] > highest[:-1]]))
 
 
-def held(values: Path, record: Bool[Array, " steps"]) -> Path:
+def forward_fill(values: Path, record: Bool[Array, " steps"]) -> Path:
     """The value at the last record up to each step, the first step being one; linear in the values.
 
     By doubling. Transposed, that is a sum over the steps that hold a value, where indexing would become a scatter, on a
@@ -116,7 +116,7 @@ def compiled[**P, R](function: Callable[P, R], level: int = 1) -> Callable[P, R]
     return run
 
 
-def shared(x: Values) -> Values:
+def recompute(x: Values) -> Values:
     """`x` itself, marked as cheap to use in several places.
 
     XLA on a CPU keeps a quotient, root or logarithm out of the loop over the data of its users if it has more than one,
@@ -127,7 +127,7 @@ def shared(x: Values) -> Values:
 
 
 @jax.custom_jvp
-def derivative_kept(x: Values) -> Values:
+def cotangent_barrier(x: Values) -> Values:
     """`x` itself, whose derivative is worked out once and kept for all its users.
 
     In reverse mode XLA otherwise computes what arrives here again in the loop of every input that it goes on to.
@@ -135,8 +135,8 @@ def derivative_kept(x: Values) -> Values:
     return x
 
 
-@derivative_kept.defjvp
-def _derivative_kept_jvp(primals, tangents):
+@cotangent_barrier.defjvp
+def _cotangent_barrier_jvp(primals, tangents):
     return primals[0], jax.lax.optimization_barrier(tangents[0])
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._format import value_of
-from ._numerics import compiled_whole, positive_pow, shared
+from ._numerics import compiled_whole, positive_pow, recompute
 from ._types import Scalar, ScalarLike, Values, scalar
 from .arguments import diameters, finite, is_traced, positive
 
@@ -82,19 +82,19 @@ class Particle(eqx.Module):
     @property
     def _uprightness(self) -> Scalar:
         # One of only two quotients, which are slow on a CPU, of all that is derived from diameters; 1 for a sphere.
-        return shared(self.D3 * self.D3 / (self.D1 * self.D2))
+        return recompute(self.D3 * self.D3 / (self.D1 * self.D2))
 
     @property
     def _per_height(self) -> Scalar:
-        return shared(1 / self.D3)
+        return recompute(1 / self.D3)
 
     def strain(self, displacement: Values) -> Values:
         """Effective strain gamma / D_e [-] of a platen displacement [um] (Bommireddy et al. 2018, eq. 4)."""
-        return shared(displacement / self.effective_diameter)
+        return recompute(displacement / self.effective_diameter)
 
     def stress(self, force: Values) -> Values:
         """Effective stress F / (pi R_e^2) [MPa] of a force [mN] (Bommireddy et al. 2018, eq. 3)."""
-        return shared(force * 1e3 / self.effective_area)
+        return recompute(force * 1e3 / self.effective_area)
 
     def displacement(self, strain: Values) -> Values:
         """Platen displacement [um] of an effective strain [-]."""
@@ -137,7 +137,7 @@ def elastic_shape_factor(particle: Particle) -> Scalar:
     .. math:: 1/\eta_e = 1 - (r^{0.1368} - 1)^{1.531}, \qquad r = \max(D_1, D_2) / \min(D_1, D_2)
 
     The paper prints :math:`D_1/D_2` for :math:`r`, which is not a number whenever :math:`D_1 < D_2`, as for 12 of its
-    own 20 particles. Against the exact elliptic contact (`law.hertz_shape_factor`) it is within 0.4 % up to r = 5.
+    own 20 particles. Against the exact elliptic contact of Hertz it is within 0.4 % up to r = 5.
 
     Returns:
         The shape factor [-], 1 at D1 = D2, where its first derivative is 0 (its second diverges).

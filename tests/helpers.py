@@ -7,6 +7,7 @@ import equinox as eqx
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 
@@ -167,3 +168,21 @@ def shape_factor(theta):
     """eta_p and D_e of a `THETA` vector, in numpy."""
     a, (D1, D2, D3) = theta[3], theta[5:]
     return 1 + a * (1 - D3**2 / (D1 * D2)), D1 * D2 / D3
+
+
+@mpmath.workdps(40)
+def exact_elastic_shape_factor(ratio):
+    """Hertz: Johnson's eqs. 4.26-4.28 as they stand, with mpmath's elliptic integrals; D1/D2 > 1."""
+    curvature = mpmath.mpf(ratio) ** 2
+
+    def excess(q):
+        b = mpmath.exp(-q)
+        K, E = mpmath.ellipk(1 - b * b), mpmath.ellipe(1 - b * b)
+        return mpmath.log((E / b**2 - K) / (K - E) / curvature)
+
+    start = mpmath.log(ratio)
+    b = mpmath.exp(-mpmath.findroot(excess, (start * 1.02, start * 1.34), solver="anderson", tol=1e-35))
+    m = 1 - b * b
+    K, E = mpmath.ellipk(m), mpmath.ellipe(m)
+    F1 = mpmath.cbrt(4 / (mpmath.pi * m) * b ** mpmath.mpf(1.5) * mpmath.sqrt((E / b**2 - K) * (K - E)))
+    return float(mpmath.pi / 2 / mpmath.sqrt(b) * F1 / K)

@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import A, between, check, close, paper_particle, sphere
+from helpers import A, between, check, close, exact_elastic_shape_factor, paper_particle, sphere
 from hypothesis import given, settings
 
 from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM
 from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
-from mcc_jax.law import hertz_shape_factor
 
 DIAMETERS = between(1, 1000)
 
@@ -27,7 +26,6 @@ def sizes_and_shapes(particle, a):
         particle.effective_diameter,
         plastic_shape_factor(particle, a),
         elastic_shape_factor(particle),
-        hertz_shape_factor(particle),
         particle.flatness,
         particle.mean_diameter,
     )
@@ -58,7 +56,6 @@ def test_sphere():
         for a in (-0.85, 0.0, A):
             assert plastic_shape_factor(sphere(size), a) == 1
         assert elastic_shape_factor(sphere(size)) == 1
-        assert hertz_shape_factor(sphere(size)) == 1
         assert sphere(size).flatness == 0
         close(sphere(size).effective_diameter, size, rel=1e-15)
         close(sphere(size).mean_diameter, size, rel=1e-15)
@@ -128,7 +125,7 @@ def test_printed_elastic_shape_factor_is_no_number_when_D1_is_the_smaller(partic
 )
 def test_elastic_shape_factor_against_the_exact_contact(ratio, percent):
     particle = Particle(ratio, 1.0, 1.0)
-    check(100 * (elastic_shape_factor(particle) / hertz_shape_factor(particle) - 1), percent)
+    check(100 * (elastic_shape_factor(particle) / exact_elastic_shape_factor(ratio) - 1), percent)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
@@ -146,10 +143,9 @@ def test_exchange_of_D1_and_D2_changes_no_bit(D1, D2, D3, a):
 def test_shape_does_not_depend_on_size(D, factor):
     small, large = (sizes_and_shapes(Particle(*d), jnp.asarray(A)) for d in (D, tuple(factor * d for d in D)))
     close(large[0], factor * small[0], rel=1e-14)
-    for i in (1, 4):
+    for i in (1, 3):
         close(large[i], small[i], scale=1e-14 * max(1, D[2] ** 2 / (D[0] * D[1])))
-    for i in (2, 3):
-        close(large[i], small[i], rel=1e-13)
+    close(large[2], small[2], rel=1e-13)
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
@@ -175,7 +171,7 @@ def test_units():
 @pytest.mark.parametrize("diameters", [(100.0, 100.0, 100.0), (80.0, 100.0, 60.0), (100.0, 80.0, 60.0)])
 def test_derivatives_of_the_shape_factors(dtype, mode, diameters):
     D = jnp.array(diameters, dtype)
-    for factor in (lambda p: plastic_shape_factor(p, jnp.asarray(A, dtype)), elastic_shape_factor, hertz_shape_factor):
+    for factor in (lambda p: plastic_shape_factor(p, jnp.asarray(A, dtype)), elastic_shape_factor):
         slope = mode(lambda D, factor=factor: factor(Particle(*D)))(D)
         assert slope.dtype == dtype
         assert np.all(np.isfinite(slope))
@@ -187,8 +183,7 @@ def test_derivatives_of_the_shape_factors(dtype, mode, diameters):
             # Beside D1 = D2 the closed form grows as |D1 - D2|^1.531.
             close(slope, np.array(ahead) / (2 * step), scale=1e-8)
     if diameters[0] == diameters[1]:
-        for factor in (elastic_shape_factor, hertz_shape_factor):
-            np.testing.assert_array_equal(mode(lambda D, factor=factor: factor(Particle(*D)))(D), 0)
+        np.testing.assert_array_equal(mode(lambda D: elastic_shape_factor(Particle(*D)))(D), 0)
 
 
 def test_batch_by_vmap_only(particles):
@@ -205,4 +200,3 @@ def test_precision_is_that_of_the_input():
     for value in (p.effective_diameter, p.effective_area, plastic_shape_factor(p, 1.43), elastic_shape_factor(p)):
         assert value.dtype == jnp.float32
     close(plastic_shape_factor(p, 1.43), 1.24420062209, rel=3e-7)
-    close(hertz_shape_factor(p), 1.0004046425, rel=3e-7)

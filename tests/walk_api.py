@@ -17,7 +17,7 @@ import pandas as pd
 
 jax.config.update("jax_enable_x64", True)
 import mcc_jax as mcc  # noqa: E402
-from mcc_jax import calibrate, campaign, dem, discover, effects, export, law, simulate  # noqa: E402
+from mcc_jax import calibrate, campaign, dem, discover, effects, export, simulate  # noqa: E402
 
 
 def outcome(call, *args, **kwargs) -> str:
@@ -64,7 +64,6 @@ def examples(folder: Path) -> dict[str, Example]:
     heights = np.linspace(2e-4, 1.9e-4, 3)
     packing = dem.spheres(the_law, [1e-4, 1.2e-4])
     side = dem.half_contact(the_law, particle)
-    ramp = np.linspace(0.0, 0.1, 4)
     return {
         "Particle": Example(mcc.Particle, D1=150.0, D2=130.0, D3=120.0),
         "Plastic": Example(mcc.Plastic, C1=7.0, C3=27.0, C5=140.0, signed=("C3",)),
@@ -79,17 +78,6 @@ def examples(folder: Path) -> dict[str, Example]:
             strain_scaling="raw",
         ),
         "paper_law": Example(mcc.paper_law, unloading="printed", strain_scaling="raw"),
-        "hertz_stress": Example(law.hertz_stress, strain=ramp, elementwise=True, effective_modulus=1e4, contacts=2),
-        "similarity_stress": Example(
-            law.similarity_stress,
-            strain=ramp,
-            elementwise=True,
-            strength=100.0,
-            exponent=3.0,
-            contacts=1,
-        ),
-        "ideal_plastic_stress": Example(law.ideal_plastic_stress, strain=ramp, elementwise=True, yield_stress=50.0),
-        "similarity_strength": Example(law.similarity_strength, yield_stress=50.0, youngs_modulus=1e4, exponent=3.0),
         "drive": Example(mcc.drive, law=the_law, particle=particle, path=path, control="displacement"),
         "simulate_batch": Example(
             mcc.simulate_batch,

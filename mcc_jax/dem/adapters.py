@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._errors import InputError
-from .._numerics import shared
+from .._numerics import recompute
 from .edges import Edges, list_edges
 from .pair import largest_overlap, pair_energy, pair_force
 from .side import HalfContact, sides_of
@@ -20,8 +20,7 @@ from .side import HalfContact, sides_of
 def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dtype | type = np.float64) -> Edges:
     """Edges of virgin contacts from a `jax_md.partition.NeighborList`; give them history with `carry_history`.
 
-    jax-md looks for pairs on the accelerator and makes its lists for one cut-off: with spheres of several sizes take
-    the largest sum of two radii. The list comes to the host here, as does that of `close_pairs`.
+    jax-md makes its lists for one cut-off: with spheres of several sizes take the largest sum of two radii.
 
     Args:
         neighbours: a list of format OrderedSparse or Sparse (``pip install mcc-jax[jaxmd]``).
@@ -50,19 +49,15 @@ def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dty
 def jaxdem_force_model(sides: HalfContact) -> Any:
     """A JaxDEM force model (`jaxdem.ForceModel`) that remembers the largest overlap of every contact.
 
-    Use it with JaxDEM's `NeighborList` collider, the one that carries history and keeps the order of particles:
+    Use it with JaxDEM's `NeighborList` collider, which carries history and keeps the order of particles:
     ``jaxdem.System.create(..., force_model=jaxdem_force_model(sides), collider_type="NeighborList", ...)``. Every
-    contact is computed from both sides, and both come to the same force. It exerts no torque. Units are those of the
-    half contacts: metres and newtons.
+    contact is computed from both sides with the same result, without torque, in metres and newtons.
 
-    Written for the interface of JaxDEM in mid 2026 (`requires_history`, `init_history`, `force_and_history`). JaxDEM
-    is not on the package index: install it from its source.
+    Written for the interface of JaxDEM in mid 2026 (`requires_history`, `init_history`, `force_and_history`). JaxDEM is
+    not on the package index: install it from its source.
 
     Args:
         sides: half contacts, one a particle in the order of the JaxDEM state, as `Packing.sides`.
-
-    Raises:
-        InputError: if JaxDEM is not installed; later, if a collider asks for a force without history.
     """
     try:
         from jaxdem import ForceModel  # pyright: ignore[reportMissingImports]
@@ -118,9 +113,9 @@ def _geometry(
     between = system.domain.displacement(pos[i], pos[j], system)
     square = jnp.sum(between * between, axis=-1)
     apart = (i != j) & (square > 0)
-    distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
+    distance = recompute(jnp.sqrt(jnp.where(apart, square, 1.0)))
     overlap = jnp.where(apart, state.rad[i] + state.rad[j] - distance, -1.0)
-    away = jnp.where(apart[..., None], between * shared(1 / distance)[..., None], 0.0)
+    away = jnp.where(apart[..., None], between * recompute(1 / distance)[..., None], 0.0)
     sides = _require(system.force_model.sides)
     return overlap, away, (sides_of(sides, jnp.minimum(i, j)), sides_of(sides, jnp.maximum(i, j)))
 

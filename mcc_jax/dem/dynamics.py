@@ -10,62 +10,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from .. import arguments
-from .._errors import InputError
 from .._format import described
-from .._numerics import shared
+from .._numerics import recompute
 from .._types import Scalar
-from .edges import relisted, stacked_lists
-from .forces import Forces, Interaction, Packing, Vector, contact_forces
+from .edges import stacked_lists, with_list
+from .forces import Forces, Motion, Vector, contact_forces
 from .measured import Sample, Trajectory, measured
 from .pair import wall_force, wall_recovery
-from .sharded import Contacts, Devices, at_home, divided
-from .state import State, check_state, listed
+from .sharded import Contacts, Devices, gathered, sharded
+from .state import Packing, State, check_state, rebuild_list
 from .walls import set_velocity
-
-
-class Motion(eqx.Module):
-    """How the packing moves.
-
-    Attributes:
-        time_step: [s]; see `stable_time_step`.
-        interaction: damping and friction of contacts.
-        drag: rate at which all velocities decay [1/s]; a way to a quasi-static state, not physics.
-        gravity: acceleration [m/s^2].
-    """
-
-    time_step: Scalar
-    interaction: Interaction
-    drag: Scalar
-    gravity: Float[Array, " 3"]
-
-    __repr__ = described(time_step="s", gravity="m/s²")
-
-    @classmethod
-    def of(
-        cls,
-        time_step: float,
-        interaction: Interaction | None = None,
-        drag: float = 0.0,
-        gravity: Sequence[float] = (0.0, 0.0, 0.0),
-        dtype: DTypeLike = jnp.float64,
-    ) -> Motion:
-        """From plain numbers.
-
-        Raises:
-            InputError: if the time step is not positive.
-        """
-        time_step = arguments.number(time_step, "the time step [s], see `stable_time_step`,", above=0)
-        drag = arguments.number(drag, "drag [1/s]", least=0)
-        acceleration = arguments.floats(gravity, "gravity", shape="three components [m/s^2]")
-        if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
-            raise InputError(f"gravity must be three finite components [m/s^2], got {arguments.shown(gravity)}")
-        given = jax.tree.map(lambda x: x.astype(dtype), interaction or Interaction())
-        return cls(jnp.asarray(time_step, dtype), given, jnp.asarray(drag, dtype), jnp.asarray(acceleration, dtype))
-
 
 Keep = Literal["steps", "lists"]
 
@@ -86,17 +43,7 @@ def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = co
 
     The list of edges is taken as it is; `advance` makes it anew in time. `contacts` computes the forces.
     """
-    forces, edges, history = contacts(
-        packing,
-        motion.interaction,
-        state.walls,
-        state.position,
-        state.velocity,
-        state.spin,
-        state.edges,
-        state.wall_history,
-        motion.time_step,
-    )
+    forces, edges, history = contacts(packing, motion, state)
     dt = motion.time_step
     velocity, spin = jax.vmap(_kicked, (None, 0, 0, 0, 0, 0, 0))(
         motion, packing.mass, packing.radius, state.velocity, state.spin, forces.force, forces.torque
@@ -120,11 +67,11 @@ def _kicked(
 ) -> tuple[Vector, Vector]:
     """Velocity and spin of one sphere after a step."""
     dt = motion.time_step
-    decay = shared(1 / (1 + dt * motion.drag))
+    decay = recompute(1 / (1 + dt * motion.drag))
     inertia = 0.4 * mass * radius * radius
     return (
-        decay * (velocity + dt * (force * shared(1 / mass) + motion.gravity)),
-        decay * (spin + dt * torque * shared(1 / inertia)),
+        decay * (velocity + dt * (force * recompute(1 / mass) + motion.gravity)),
+        decay * (spin + dt * torque * recompute(1 / inertia)),
     )
 
 
@@ -139,9 +86,7 @@ def run(
     """Steps on one list of edges, as one compiled loop, differentiable in both modes.
 
     Args:
-        packing: the spheres.
-        motion: time step, damping, friction.
-        state: where to start.
+        packing, motion, state: spheres, time step with damping and friction, and where to start.
         steps: length of the loop.
         wanted: how many of these steps are taken.
         devices: over which the contacts are divided (`jax.devices()`); not divided if None.
@@ -156,14 +101,14 @@ def run(
 
         return jax.lax.scan(one, state, jnp.arange(steps))[0], ()
 
-    return divided(loop, devices, packing, motion, state, jnp.asarray(wanted))[0]
+    return sharded(loop, devices, packing, motion, state, jnp.asarray(wanted))[0]
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _run_while_listed(
     devices: Devices | None, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""]
 ) -> tuple[State, tuple[Int[Array, ""], Float[Array, "walls 3"]]]:
-    return divided(_while_listed, devices, packing, motion, state, steps)
+    return sharded(_while_listed, devices, packing, motion, state, steps)
 
 
 def _while_listed(
@@ -171,7 +116,7 @@ def _while_listed(
 ) -> tuple[State, tuple[Int[Array, ""], Float[Array, "walls 3"]]]:
     """Steps for as long as the list is complete: no particle further than half the skin from where it was listed."""
 
-    def goes_on(carry):
+    def list_valid(carry):
         state, done, _ = carry
         away = jnp.max(jnp.sum((state.position - state.listed_at) ** 2, axis=1))
         return (done < steps) & (away <= (state.skin / 2) ** 2)
@@ -182,7 +127,7 @@ def _while_listed(
         return state, done + 1, on_wall + forces.on_wall
 
     walls = jnp.zeros((len(state.walls), 3), state.velocity.dtype)
-    state, done, on_wall = jax.lax.while_loop(goes_on, one, (state, jnp.zeros_like(steps), walls))
+    state, done, on_wall = jax.lax.while_loop(list_valid, one, (state, jnp.zeros_like(steps), walls))
     return state, (done, on_wall)
 
 
@@ -200,9 +145,7 @@ def advance(
     """Move on for a time, with a new list of edges whenever a particle has moved by half the skin.
 
     Args:
-        packing: the spheres.
-        motion: time step, damping, friction.
-        state: where to start.
+        packing, motion, state: spheres, time step with damping and friction, and where to start.
         velocity: of each wall [m/s].
         rows: how often something is measured.
         steps: steps from one row to the next.
@@ -216,26 +159,26 @@ def advance(
         The state at the end, with the walls still moving, and the rows.
 
     Raises:
-        InputError: if a particle left the walls, a position became NaN. The state passed in is untouched.
+        InputError: if a particle left the walls or a position became NaN. The state passed in is untouched.
     """
     rows, steps = arguments.whole(rows, "rows"), arguments.whole(steps, "steps")
     skin = arguments.number(skin, "skin [m]", least=0)
     state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, velocity))
     made = 0
     if skin > float(state.skin):  # the list at hand may not hold all the pairs that the caller relies on
-        state, made = listed(packing, state, skin), 1
+        state, made = rebuild_list(packing, state, skin), 1
     table, lists, capacity = [], [], []
     for _ in range(rows):
         left, on_wall = steps, 0.0
         while left:
-            state, (done, force) = at_home(_run_while_listed, devices, packing, motion, state, jnp.asarray(left))
+            state, (done, force) = gathered(_run_while_listed, devices, packing, motion, state, jnp.asarray(left))
             on_wall = on_wall + force
             left -= int(done)
             if tape is not None and int(done):
                 tape.append(Segment(state.edges.key, state.edges.i, state.edges.j, done))
             if left:
                 check_state(state)
-                state = listed(packing, state, skin)
+                state = rebuild_list(packing, state, skin)
                 made += 1
         check_state(state)
         table.append(measured(packing, state, on_wall / steps))
@@ -255,12 +198,11 @@ def replay(
 ) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
-    Neighbour lists have no derivative and are made on the host; the contacts on them have. A gradient through thousands
-    of steps is exact for that trajectory and says little about compaction: rearrangements are chaotic (see `compact`).
+    A gradient through thousands of steps is exact for that trajectory and says little about compaction: rearrangements
+    are chaotic (see `compact`).
 
     Args:
-        packing: the spheres.
-        motion: as in `advance`.
+        packing, motion: as in `advance`.
         state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
         tape: of one call of `advance`.
         devices: as in `run`.
@@ -274,10 +216,10 @@ def replay(
     segments = stacked_lists(tape)
 
     def one(state: State, segment: Segment) -> tuple[State, None]:
-        state = eqx.tree_at(lambda s: s.edges, state, relisted(state.edges, segment.key, segment.i, segment.j))
+        state = eqx.tree_at(lambda s: s.edges, state, with_list(state.edges, segment.key, segment.i, segment.j))
         return run(packing, motion, state, longest, segment.steps, devices), None
 
-    first = relisted(state.edges, segments.key[0], segments.i[0], segments.j[0])  # as long as all others
+    first = with_list(state.edges, segments.key[0], segments.i[0], segments.j[0])  # as long as all others
     state = eqx.tree_at(lambda s: s.edges, state, first)
     return jax.lax.scan(jax.checkpoint(one) if keep == "lists" else one, state, segments)[0]
 
@@ -288,11 +230,7 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
     .. math:: \Delta t = s \min_i \sqrt{m_i / k_i}
 
     with k_i the steepest slope of unloading of particle i against its like from eta_p eps = 0.67, some thirty times the
-    initial stiffness. Above that range take less.
-
-    Args:
-        packing: the spheres.
-        safety: s; 0.3 leaves room for several contacts a particle.
+    initial stiffness; above that range take less. The safety s = 0.3 allows for several contacts a particle.
     """
     safety = arguments.number(safety, "safety", above=0)
 
@@ -306,9 +244,8 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
 def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, Motion, State]:
     """The same with forces, velocities and history in float32; positions, walls and time stay in double precision.
 
-    An overlap is a small difference of coordinates, and the way of a punch in one step is smaller still: in float32 a
-    die of 1 mm knows places to 1e-10 m only. Forces err by about 1e-6 of the largest (tested to 1e-5). History takes
-    16 B an edge instead of 32; what the state remembers is rounded.
+    An overlap is a small difference of coordinates: in float32 a die of 1 mm knows places to 1e-10 m only. Forces err
+    by about 1e-6 of the largest (tested to 1e-5). History takes 16 B an edge instead of 32.
     """
 
     def fields(state: State) -> tuple[Any, ...]:

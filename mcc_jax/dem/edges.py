@@ -23,9 +23,8 @@ PADDING = np.iinfo(np.int64).max
 class Edges(eqx.Module):
     r"""Pairs of particles that touch or may soon, sorted by key, in a list of fixed length.
 
-    The key of a pair is :math:`\min(i, j)\,N + \max(i, j)` and its sides are ordered by index, whatever order a
-    neighbour list names them in. History follows the key. A pair that leaves the list loses its history: should it come
-    back, it is a virgin contact.
+    The key of a pair is :math:`\min(i, j)\,N + \max(i, j)`, its sides are ordered by index, and history follows the
+    key. A pair that leaves the list loses its history: should it come back, it is a virgin contact.
 
     Attributes:
         key: keys, ascending, then padding. 8 B an edge; needs double precision switched on, the rest does not.
@@ -58,15 +57,11 @@ class Edges(eqx.Module):
 
     @property
     def overflow(self) -> Flag:
-        """Whether pairs were left out for want of room."""
+        """Whether the list is too short and pairs were left out."""
         return self.wanted > self.capacity
 
     def require_room(self) -> None:
-        """Refuse to go on with a list from which pairs are missing.
-
-        Raises:
-            InputError: if the list overflowed.
-        """
+        """Refuse to go on with a list from which pairs are missing."""
         if bool(self.overflow):
             raise InputError(
                 f"{int(self.wanted)} pairs do not fit into a list of {self.capacity} edges",
@@ -75,13 +70,12 @@ class Edges(eqx.Module):
 
 
 def close_pairs(position: Any, radius: Any, skin: float) -> Int[np.ndarray, "pairs 2"]:
-    r"""All pairs whose surfaces are closer than the skin, :math:`|x_i - x_j| < R_i + R_j + s`.
+    """All pairs whose surfaces are closer than the skin, :math:`|x_i - x_j| < R_i + R_j + s`.
 
     By `vesin` if it is installed (``pip install mcc-jax[neighbours]``), else by SciPy's k-d tree; the same pairs.
 
     Args:
-        position: centres [m].
-        radius: radii [m].
+        position, radius: centres and radii [m].
         skin: extra distance [m]. No pair can touch unseen until a particle has moved by half of it.
 
     Raises:
@@ -133,8 +127,7 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
         dtype: precision of the history.
 
     Raises:
-        InputError: if an index is not of a particle, if a particle is paired with itself, or without double precision,
-            which 64-bit keys need.
+        InputError: if an index is not of a particle, a particle is paired with itself, or without double precision.
     """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
@@ -143,10 +136,10 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
         )
     particles = arguments.whole(particles, "particles")
     capacity = arguments.whole(capacity, "capacity")
-    given = arguments.floats(pairs, "pairs", shape="pairs of indices, shape (pairs, 2)")
-    if given.size and (given.ndim != 2 or given.shape[1] != 2 or not (given == np.floor(given)).all()):
-        raise InputError(f"pairs must be pairs of whole numbers, shape (pairs, 2), got the shape {given.shape}")
-    pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
+    given = np.asarray(pairs)
+    if given.size and (given.dtype.kind not in "iu" or given.ndim != 2 or given.shape[1] != 2):
+        raise InputError(f"pairs must be pairs of whole numbers, shape (pairs, 2), got {arguments.shown(pairs)}")
+    pairs = given.astype(np.int64).reshape(-1, 2)
     low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
     wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))
     if wrong.size:
@@ -169,67 +162,34 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
 
 @jax.jit
 def carry_history(old: Edges, new: Edges) -> Edges:
-    """The new list with the history of the pairs that were in the old one, bit for bit; others start virgin.
-
-    Both lists are of the same particles, their capacities may differ.
-    """
+    """The new list with the history of the pairs that were in the old one, bit for bit; others start virgin."""
     place = jnp.searchsorted(old.key, new.key).clip(0, old.capacity - 1)
     known = (old.key[place] == new.key) & new.active
     history = jnp.where(known, old.overlap_max[place], 0.0), jnp.where(known[:, None], old.slip[place], 0.0)
     return eqx.tree_at(lambda e: (e.overlap_max, e.slip), new, history)
 
 
-def relisted(old: Edges, key: Array, i: Array, j: Array) -> Edges:
+def with_list(old: Edges, key: Array, i: Array, j: Array) -> Edges:
     """The contacts on another list of the same particles, with the history of the pairs that were in the old one."""
     overlap_max, slip = jnp.zeros(key.shape[0], old.slip.dtype), jnp.zeros((key.shape[0], 3), old.slip.dtype)
     return carry_history(old, Edges(key, i, j, overlap_max, slip, old.wanted, old.particles))
 
 
 def stacked_lists[Recorded: Any](tape: Sequence[Recorded]) -> Recorded:
-    """Named tuples with a list of edges each (`key`, `i`, `j`) as one with a leading axis, lists filled up alike."""
-    room = max(step.key.shape[0] for step in tape)
+    """Named tuples with a list of edges each (`key`, `i`, `j`) as one with a leading axis, padded to one length."""
+    longest = max(step.key.shape[0] for step in tape)
 
     def padded(step: Recorded) -> Recorded:
-        spare = (0, room - step.key.shape[0])
-        key = np.pad(step.key, spare, constant_values=PADDING)
-        return step._replace(key=key, i=np.pad(step.i, spare), j=np.pad(step.j, spare))
+        i, j = pad_rows((step.i, step.j), longest)
+        return step._replace(key=pad_rows(step.key, longest, PADDING), i=i, j=j)
 
     return type(tape[0])(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
 
 
-def lengthened[Rows: eqx.Module](tree: Rows, rows: int) -> Rows:
-    """The same with as many rows in every array that has some, the new ones 0."""
-    return jax.tree.map(lambda x: jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)) if x.ndim else x, tree)
+def pad_rows(tree: Any, rows: int, value: int = 0) -> Any:
+    """The arrays of a tree with so many rows, the new ones filled with a value."""
 
+    def longer(x: Array) -> Array:
+        return jnp.pad(x, [(0, rows - len(x)), *[(0, 0)] * (x.ndim - 1)], constant_values=value)
 
-def widened(edges: Edges, capacity: int) -> Edges:
-    """The same list with room for more."""
-    key = jnp.pad(edges.key, (0, capacity - edges.capacity), constant_values=PADDING)
-    return eqx.tree_at(lambda e: e.key, lengthened(edges, capacity), key)
-
-
-@jax.jit
-def relabel(edges: Edges, label: Int[Array, " particles"]) -> Edges:
-    """The same contacts after particle k became particle `label[k]`, a permutation.
-
-    A pair whose order turns over sees its slip, which is of j against i, from the other side.
-    """
-    i, j = label[edges.i], label[edges.j]
-    key = jnp.minimum(i, j).astype(edges.key.dtype) * edges.particles + jnp.maximum(i, j)
-    key = jnp.where(edges.active, key, PADDING)
-    order = jnp.argsort(key)
-    turned = jnp.where(i > j, -1.0, 1.0).astype(edges.slip.dtype)
-    padding = ~edges.active
-
-    def sorted_index(values: Array) -> Array:
-        return jnp.where(padding, 0, values).astype(edges.i.dtype)[order]
-
-    return Edges(
-        key[order],
-        sorted_index(jnp.minimum(i, j)),
-        sorted_index(jnp.maximum(i, j)),
-        edges.overlap_max[order],
-        jax.vmap(jnp.multiply)(edges.slip, turned)[order],
-        edges.wanted,
-        edges.particles,
-    )
+    return jax.tree.map(longer, tree)

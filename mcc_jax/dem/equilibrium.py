@@ -11,8 +11,8 @@ import optimistix as optx
 from jaxtyping import Array, Int
 
 from .._types import Flag, Scalar
-from .forces import Vectors
-from .stiffness import Balance, Held, Stiffness, balance, net_force
+from .state import Vectors
+from .stiffness import Balance, Problem, Stiffness, balance, net_force
 
 SUFFICIENT = 1e-4
 """Share of the decrease the slope promises that a step must bring (Armijo)."""
@@ -31,11 +31,11 @@ class _State(eqx.Module):
 
 
 class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
-    r"""Newton's method on the energy of a packing, with a line search.
+    """Newton's method on the energy of a packing, with a line search.
 
-    Contacts stiffen thirty times and more where they turn from loading to unloading, so that the net force has kinks,
-    but it is minus the gradient of an energy, which has none: the energy says whether a step is good. Where the
-    stiffness is not positive definite (forces that turn destabilise) its material part gives the direction.
+    Contacts stiffen thirty times and more where they turn from loading to unloading, so that the net force has kinks.
+    It is minus the gradient of an energy, which has none and so judges a step. Where the stiffness is not positive
+    definite (forces that turn destabilise) its material part gives the direction.
 
     Attributes:
         rtol: largest net force over the mean contact force at which a packing counts as settled.
@@ -103,7 +103,7 @@ def _direction(at: Balance, reach: Scalar) -> Vectors:
     return step * jnp.minimum(1.0, reach / jnp.maximum(jnp.max(jnp.abs(step)), jnp.finfo(step.dtype).tiny))
 
 
-class Settled(NamedTuple):
+class Equilibrium(NamedTuple):
     """The end of one load step.
 
     Attributes:
@@ -119,36 +119,34 @@ class Settled(NamedTuple):
     steps: Int[Array, ""]
 
 
-def settle(held: Held, guess: Vectors, rtol: Scalar | float, max_steps: int) -> Settled:
+def find_equilibrium(problem: Problem, guess: Vectors, rtol: Scalar | float, max_steps: int) -> Equilibrium:
     r"""Centres at which the net force vanishes, a minimum of the energy of contacts and proximal springs.
 
     .. math:: f(x; \theta) - \mu (x - x_{prev}) = 0, \qquad K\, dx = \partial_\theta f\, d\theta + \mu\, dx_{prev}
 
+    Differentiable in `problem` in both modes; a load step that did not converge returns where it got to.
+
     Args:
-        held: packing, walls, history and springs.
+        problem: packing, walls, history and springs.
         guess: where to start [m].
         rtol: largest net force over the mean contact force.
         max_steps: evaluations before giving up.
-
-    Returns:
-        The centres, differentiable in `held` in both modes, and whether they are an equilibrium. A load step that did
-        not converge returns where it got to.
     """
-    fixed = jax.lax.stop_gradient(held)
+    fixed = jax.lax.stop_gradient(problem)
     sides, radius = fixed.packing.sides, fixed.packing.radius
     atol, reach = 1e-12 * jnp.mean(sides.k1 * radius), 0.3 * jnp.min(radius)
     solver = ContactNewton(rtol, atol, reach)  # pyright: ignore[reportCallIssue]  # `norm` is a method here
 
-    def energy(position: Vectors, held: Held) -> tuple[Scalar, Balance]:
-        at = balance(held, position)
+    def energy(position: Vectors, problem: Problem) -> tuple[Scalar, Balance]:
+        at = balance(problem, position)
         return at.energy, at
 
     found = optx.minimise(
         energy, solver, jax.lax.stop_gradient(guess), fixed, has_aux=True, max_steps=max_steps, throw=False
     )
     at = found.aux
-    position = _implicit(found.value, at.stiffness, net_force(held, found.value))
-    return Settled(position, at, found.result == optx.RESULTS.successful, found.stats["num_steps"])
+    position = _implicit(found.value, at.stiffness, net_force(problem, found.value))
+    return Equilibrium(position, at, found.result == optx.RESULTS.successful, found.stats["num_steps"])
 
 
 @eqx.filter_custom_jvp

@@ -2,44 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .. import arguments
+from .._errors import InputError
 from .._format import described
-from .._numerics import shared
+from .._numerics import recompute
 from .._types import Flag, Scalar, ScalarLike, scalar
 from .edges import Edges
 from .pair import largest_overlap, pair_force, wall_force
 from .side import HalfContact
+from .state import Packing, State, Vectors, WallHistory
 from .walls import Wall, Walls, dot
 
-Vectors = Float[Array, "particles 3"]
 Vector = Float[Array, " 3"]
-
-
-class Packing(eqx.Module):
-    """Spheres, and how each of them pushes back.
-
-    Attributes:
-        radius: [m].
-        mass: [kg].
-        sides: half contacts, one a particle (``jax.vmap(half_contact)``).
-    """
-
-    radius: Float[Array, " particles"]
-    mass: Float[Array, " particles"]
-    sides: HalfContact
-
-    __repr__ = described(radius="m", mass="kg")
-
-    @property
-    def volume(self) -> Scalar:
-        """Volume of all spheres [m^3], overlaps not taken off."""
-        return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
 def _share(value: ScalarLike) -> Scalar:
@@ -77,23 +60,40 @@ class Interaction(eqx.Module):
     __repr__ = described()
 
 
-class WallHistory(eqx.Module):
-    """What the contacts with walls remember: dense, one place for each particle and wall.
+class Motion(eqx.Module):
+    """How the packing moves.
 
     Attributes:
-        overlap_max: largest overlap so far [m].
-        slip: elastic tangential displacement of the wall against the particle's surface [m].
+        time_step: [s]; see `stable_time_step`.
+        interaction: damping and friction of contacts.
+        drag: rate at which all velocities decay [1/s]; a way to a quasi-static state, not physics.
+        gravity: acceleration [m/s^2].
     """
 
-    overlap_max: Float[Array, "particles walls"]
-    slip: Float[Array, "particles walls 3"]
+    time_step: Scalar
+    interaction: Interaction
+    drag: Scalar
+    gravity: Float[Array, " 3"]
 
-    __repr__ = described()
+    __repr__ = described(time_step="s", gravity="m/s²")
 
     @classmethod
-    def virgin(cls, particles: int, walls: int, dtype: DTypeLike = jnp.float64) -> WallHistory:
-        """Nothing has touched yet."""
-        return cls(jnp.zeros((particles, walls), dtype), jnp.zeros((particles, walls, 3), dtype))
+    def of(
+        cls,
+        time_step: float,
+        interaction: Interaction | None = None,
+        drag: float = 0.0,
+        gravity: Sequence[float] = (0.0, 0.0, 0.0),
+        dtype: DTypeLike = jnp.float64,
+    ) -> Motion:
+        """From plain numbers."""
+        time_step = arguments.number(time_step, "the time step [s], see `stable_time_step`,", above=0)
+        drag = arguments.number(drag, "drag [1/s]", least=0)
+        acceleration = arguments.floats(gravity, "gravity", shape="three components [m/s^2]")
+        if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
+            raise InputError(f"gravity must be three finite components [m/s^2], got {arguments.shown(gravity)}")
+        given = jax.tree.map(lambda x: x.astype(dtype), interaction or Interaction())
+        return cls(jnp.asarray(time_step, dtype), given, jnp.asarray(drag, dtype), jnp.asarray(acceleration, dtype))
 
 
 class Forces(eqx.Module):
@@ -124,51 +124,35 @@ class _Body(eqx.Module):
 
 
 class _Contact(eqx.Module):
-    """One contact: force on the first body, its couple per radius of either body, and what the contact remembers."""
+    """One contact: force on the first body, its moment per unit arm, and what the contact remembers."""
 
     force: Vector
-    couple: Vector
+    moment: Vector
     overlap_max: Scalar
     slip: Vector
 
 
 def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tuple[Scalar, Vector]:
-    """Overlap [m] of two spheres and unit vector from i to j.
+    """Overlap [m] of two spheres and unit vector from i to j, from centres [m] and the sum of the radii [m].
 
-    Two centres in one place have no normal: they get none, and so no force. A place in the list that no pair uses
-    overlaps by -1 m. A position that is NaN shows. The overlap, a small difference of large numbers, is taken in the
-    precision of the positions and then rounded to that of the radii.
-
-    Args:
-        i, j: centres [m].
-        reach: sum of the radii [m].
-        listed: whether this is a pair at all.
+    Coincident centres: zero normal, no force. Unused places of the list: overlap -1 m. A position that is NaN shows.
+    The overlap, a small difference of large numbers, is taken in the precision of the positions and then rounded.
     """
     between = j - i
     square = dot(between, between)
     apart = listed & (square > 0)
-    distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
+    distance = recompute(jnp.sqrt(jnp.where(apart, square, 1.0)))
     separation = reach.astype(distance.dtype) - distance
     overlap = jnp.where(apart, separation, jnp.where(listed & jnp.isnan(square), square, -1.0))
-    normal = jnp.where(apart, between * shared(1 / distance), 0.0)
+    normal = jnp.where(apart, between * recompute(1 / distance), 0.0)
     return overlap.astype(reach.dtype), normal.astype(reach.dtype)
 
 
-def contact_forces(
-    packing: Packing,
-    interaction: Interaction,
-    walls: Walls,
-    position: Vectors,
-    velocity: Vectors,
-    spin: Vectors,
-    edges: Edges,
-    history: WallHistory,
-    time_step: Scalar,
-) -> tuple[Forces, Edges, WallHistory]:
-    """Forces of all contacts, and what they remember after them; slip adds up over the time step [s]."""
-    bodies = bodies_of(packing, position, velocity, spin)
-    load, edges = pair_loads(interaction, bodies, edges, time_step)
-    at_walls, on_wall, history = wall_loads(interaction, walls, bodies, history, time_step)
+def contact_forces(packing: Packing, motion: Motion, state: State) -> tuple[Forces, Edges, WallHistory]:
+    """Forces of all contacts, and what they remember after them; slip adds up over the time step."""
+    bodies = bodies_of(packing, state.position, state.velocity, state.spin)
+    load, edges = pair_loads(motion, bodies, state.edges)
+    at_walls, on_wall, history = wall_loads(motion, state.walls, bodies, state.wall_history)
     load = load + at_walls
     return Forces(load[:, :3], load[:, 3:], on_wall), edges, history
 
@@ -178,16 +162,14 @@ def bodies_of(packing: Packing, position: Vectors, velocity: Vectors, spin: Vect
     return jax.vmap(_Body)(packing.radius, packing.mass, packing.sides, position, velocity, spin)
 
 
-def pair_loads(
-    interaction: Interaction, bodies: _Body, edges: Edges, time_step: Scalar
-) -> tuple[Float[Array, "particles 6"], Edges]:
+def pair_loads(motion: Motion, bodies: _Body, edges: Edges) -> tuple[Float[Array, "particles 6"], Edges]:
     """Force and torque of all edges, or any part of them, summed over the particles, and what the edges remember."""
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
-    between = jax.vmap(_between, (None, 0, 0, 0, 0, 0, None))
-    pairs = between(interaction, i, j, edges.active, edges.overlap_max, edges.slip, time_step)
+    between = jax.vmap(_between, (None, 0, 0, 0, 0, 0))
+    pairs = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
     on_i, on_j = pairs.force, -pairs.force
-    if interaction.friction is not None:  # without it there is no torque to add up
-        on_i, on_j = _load(on_i, i.radius, pairs.couple), _load(on_j, j.radius, pairs.couple)
+    if motion.interaction.friction is not None:  # without it there is no torque to add up
+        on_i, on_j = _load(on_i, i.radius, pairs.moment), _load(on_j, j.radius, pairs.moment)
     total = jnp.zeros((bodies.radius.shape[0], on_i.shape[1]), bodies.radius.dtype)
     total = total.at[edges.i].add(on_i).at[edges.j].add(on_j)
     total = jnp.pad(total, ((0, 0), (0, 6 - total.shape[1])))
@@ -195,15 +177,15 @@ def pair_loads(
 
 
 def wall_loads(
-    interaction: Interaction, walls: Walls, bodies: _Body, history: WallHistory, time_step: Scalar
+    motion: Motion, walls: Walls, bodies: _Body, history: WallHistory
 ) -> tuple[Float[Array, "particles 6"], Float[Array, "walls 3"], WallHistory]:
     """Force and torque of the walls on all particles, or any part of them, forces on the walls, and the memory."""
     load = jnp.zeros((bodies.radius.shape[0], 6), bodies.radius.dtype)
     on_wall, columns = [], []
     for w, wall in enumerate(walls):
-        against = jax.vmap(_against, (None, None, 0, 0, 0, None))
-        contacts = against(interaction, wall, bodies, history.overlap_max[:, w], history.slip[:, w], time_step)
-        load = load + _load(contacts.force, bodies.radius, contacts.couple)
+        against = jax.vmap(_against, (None, None, 0, 0, 0))
+        contacts = against(motion, wall, bodies, history.overlap_max[:, w], history.slip[:, w])
+        load = load + _load(contacts.force, bodies.radius, contacts.moment)
         on_wall.append(-jnp.sum(contacts.force, axis=0))
         columns.append((contacts.overlap_max, contacts.slip))
     if not walls:
@@ -212,42 +194,38 @@ def wall_loads(
 
 
 @jax.vmap
-def _load(force: Vector, radius: Scalar, couple: Vector) -> Float[Array, " 6"]:
-    return jnp.concatenate([force, radius * couple])
+def _load(force: Vector, radius: Scalar, moment: Vector) -> Float[Array, " 6"]:
+    return jnp.concatenate([force, radius * moment])
 
 
-def _between(
-    interaction: Interaction, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector, time_step: Scalar
-) -> _Contact:
+def _between(motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector) -> _Contact:
+    friction = motion.interaction.friction
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
     relative = j.velocity - i.velocity
-    if interaction.friction is not None:
+    if friction is not None:
         relative = relative - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
     # Without the barriers XLA computes the law again for every use of its force.
     overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
     elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
-    k = shared(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
-    mass = shared(i.mass * j.mass / (i.mass + j.mass))
-    friction = interaction.friction
-    return _contact(interaction, friction, elastic, k, mass, normal, relative, overlap_max, overlap, slip, time_step)
+    k = recompute(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
+    mass = recompute(i.mass * j.mass / (i.mass + j.mass))
+    return _contact(motion, friction, elastic, k, mass, normal, relative, overlap_max, overlap, slip)
 
 
-def _against(
-    interaction: Interaction, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector, time_step: Scalar
-) -> _Contact:
-    dtype = body.radius.dtype
+def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> _Contact:
+    friction, dtype = motion.interaction.wall_friction, body.radius.dtype
     outward = -wall.normal_at(body.position).astype(dtype)
     overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
     relative = wall.velocity.astype(dtype) - body.velocity
-    if interaction.wall_friction is not None:
+    if friction is not None:
         relative = relative - jnp.cross(body.radius * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
-    friction, k, mass = interaction.wall_friction, body.side.k1, body.mass
-    return _contact(interaction, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip, time_step)
+    k, mass = body.side.k1, body.mass
+    return _contact(motion, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip)
 
 
 def _contact(
-    interaction: Interaction,
+    motion: Motion,
     friction: Scalar | None,
     elastic: Scalar,
     k: Scalar,
@@ -257,13 +235,12 @@ def _contact(
     overlap_max: Scalar,
     overlap: Scalar,
     slip: Vector,
-    time_step: Scalar,
 ) -> _Contact:
     """Force on the first body; the normal points from it to the second, whose surface moves relative to its own."""
     opening = dot(relative, normal)
     touching = elastic > 0
-    damping = 2 * interaction.damping
-    push = elastic - damping * shared(jnp.sqrt(mass * k)) * opening
+    damping = 2 * motion.interaction.damping
+    push = elastic - damping * recompute(jnp.sqrt(mass * k)) * opening
     push = jnp.where(touching & (push > 0), push, jnp.where(jnp.isnan(elastic), elastic, 0.0))
     overlap_max = largest_overlap(overlap_max, overlap)
     if friction is None:
@@ -273,17 +250,17 @@ def _contact(
     sliding = relative - opening * normal
     in_plane = slip - dot(slip, normal) * normal
     sliding, push, in_plane = jax.lax.optimization_barrier((sliding, push, in_plane))
-    slip = in_plane * shared(_norm(slip) / (_norm(in_plane) + jnp.finfo(slip.dtype).tiny ** 0.5))
-    slip = slip + time_step * sliding
-    stiffness = interaction.tangential_ratio * k
-    trial = stiffness * slip + damping * shared(jnp.sqrt(mass * stiffness)) * sliding
+    slip = in_plane * recompute(_norm(slip) / (_norm(in_plane) + jnp.finfo(slip.dtype).tiny ** 0.5))
+    slip = slip + motion.time_step * sliding
+    stiffness = motion.interaction.tangential_ratio * k
+    trial = stiffness * slip + damping * recompute(jnp.sqrt(mass * stiffness)) * sliding
     slip, trial = jax.lax.optimization_barrier((slip, trial))
     limit = friction * push
     size = _norm(trial)
     slips = size > limit
-    tangential = trial * jnp.where(slips, shared(limit / jnp.where(slips, size, 1.0)), 1.0)
+    tangential = trial * jnp.where(slips, recompute(limit / jnp.where(slips, size, 1.0)), 1.0)
     tangential = jax.lax.optimization_barrier(tangential)
-    held = jnp.where(slips, tangential * shared(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
+    held = jnp.where(slips, tangential * recompute(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
     return _Contact(
         tangential - push * normal, jnp.cross(normal, tangential), overlap_max, jnp.where(touching, held, 0.0)
     )
@@ -292,4 +269,4 @@ def _contact(
 def _norm(vector: Vector) -> Scalar:
     square = dot(vector, vector)
     some = square > 0
-    return jnp.where(some, shared(jnp.sqrt(jnp.where(some, square, 1.0))), 0.0)
+    return jnp.where(some, recompute(jnp.sqrt(jnp.where(some, square, 1.0))), 0.0)

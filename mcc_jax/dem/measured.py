@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, Int
 
 from .._format import described
 from .._types import Scalar
-from .forces import Packing, overlap_and_normal
+from .forces import overlap_and_normal
 from .pair import pair_split
 from .side import sides_of
-from .state import State
+from .state import Packing, State
 from .walls import Walls
 
 

@@ -14,8 +14,8 @@ from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-from .forces import Packing
 from .side import half_contact, passive
+from .state import Packing
 
 MCC_DENSITY = 1540.0
 """True density of micro-crystalline cellulose, about [kg/m^3]."""
@@ -28,9 +28,6 @@ def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing
         law: one law for all, or a batch of laws with one for each sphere.
         diameter: [um].
         density: of the particle, pores included [kg/m^3].
-
-    Raises:
-        InputError: if a diameter or the density is not positive.
     """
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")  # traced ones pass
@@ -49,19 +46,12 @@ def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing
 def scattered(
     key: PRNGKeyArray, radius: Any, die_radius: float, gap: float = 0.02
 ) -> tuple[Float[Array, "particles 3"], float]:
-    """Centres of spheres in a die, in random order on a jittered lattice, none touching.
+    """Centres [m] of spheres over z = 0 in a die, none touching, and the height of the die [m]; a jittered lattice.
 
     Args:
         key: random key.
-        radius: [m].
-        die_radius: [m].
+        radius, die_radius: [m].
         gap: least distance between surfaces, as a share of the largest radius.
-
-    Returns:
-        Centres [m] over z = 0, and the height of the die that holds them [m].
-
-    Raises:
-        InputError: if a size is not positive, or the die is narrower than the largest sphere.
     """
     radius = arguments.path(radius, "radius", many="Give one radius [m] for each sphere.")
     arguments.positive(radius, "radius [m]")

@@ -1,26 +1,92 @@
-"""Quasi-static compaction in a die: as many load steps as it takes, each in equilibrium."""
+"""Quasi-static compaction in a die: as many load steps as it takes, each in equilibrium; and again, differentiable."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Scalar
-from .edges import Edges
-from .equilibrium import Settled, settle
-from .forces import Packing
-from .load_steps import BOTTOM, TOP, LoadStep, Solver, die_walls, lowered
+from .edges import Edges, stacked_lists, with_list
+from .equilibrium import Equilibrium, find_equilibrium
 from .measured import measured
-from .state import State, check_packing, check_state, listed, start
-from .stiffness import Held, pair_geometry, remembered
-from .walls import Walls
+from .state import (
+    Packing,
+    State,
+    Vectors,
+    WallHistory,
+    check_packing,
+    check_state,
+    rebuild_list,
+    start,
+)
+from .stiffness import Problem, force_on_walls, net_force, pair_geometry, remembered
+from .walls import Cylinder, Plane, Walls
+
+BOTTOM, TOP = 0, 1
+
+
+class Solver(eqx.Module):
+    """How a load step is solved. The defaults suit from ten to a few thousand spheres.
+
+    Attributes:
+        springs: stiffnesses of the proximal springs, in turn, as shares of the mean initial stiffness; each equilibrium
+            is where the search for the next begins. The last, small one gives particles that touch nothing a place.
+        rtol: largest net force over the mean contact force.
+        max_steps: evaluations before an equilibrium is given up.
+        halvings: how often a load step that did not converge is halved.
+        skin: extra distance up to which pairs are listed, as a share of the mean radius. Ample: a load step that ends
+            with unlisted particles touching is solved again from there, and may so end elsewhere.
+    """
+
+    springs: tuple[float, ...] = eqx.field(static=True, default=(1e-1, 1e-2, 1e-3, 1e-4))
+    rtol: float = eqx.field(static=True, default=1e-10)
+    max_steps: int = eqx.field(static=True, default=150)
+    halvings: int = eqx.field(static=True, default=4)
+    skin: float = eqx.field(static=True, default=0.5)
+
+    __repr__ = described()
+
+    def __check_init__(self) -> None:
+        for spring in self.springs:
+            arguments.number(spring, "every one of springs", above=0)
+        arguments.number(self.rtol, "rtol", above=0)
+        arguments.whole(self.max_steps, "max_steps", least=1)
+        arguments.whole(self.halvings, "halvings")
+        arguments.number(self.skin, "skin", above=0)
+        if not self.springs:
+            raise InputError("a solver without springs", remedy="Give at least one.")
+
+
+class LoadStep(NamedTuple):
+    """What `replay_compaction` needs of a load step.
+
+    Attributes:
+        key, i, j: the list of edges.
+        height: of the top punch [m].
+        spring: stiffness of the proximal springs [N/m].
+        position: centres at its end [m].
+        last: whether a row of the table ends with it.
+    """
+
+    key: Int[Array, " edges"]
+    i: Int[Array, " edges"]
+    j: Int[Array, " edges"]
+    height: Scalar
+    spring: Scalar
+    position: Vectors
+    last: bool | Bool[Array, " steps"]
+
+    __repr__ = described()
 
 
 class Compaction(NamedTuple):
@@ -32,11 +98,9 @@ class Compaction(NamedTuple):
         top, bottom: force on the punches [N].
         converged: whether every load step of the row ended in equilibrium. Do not use a row that did not.
         residual: largest net force on a particle over the mean contact force [-].
-        proximal_share: sum of the proximal springs' axial forces, without sign, over the force on the top punch;
-            infinite where there is none [-].
+        proximal_share: sum of the proximal springs' axial forces, without sign, over the force on the top punch [-].
         spring: the proximal springs' stiffness over the mean initial stiffness [-].
-        load_steps: into how many steps the row was divided.
-        evaluations: of forces and stiffness.
+        load_steps, evaluations: steps of the row; evaluations of forces and stiffness.
         largest_move: of a particle, over the punch's [-]; far above one where contacts snapped.
         contacts: pairs and walls that touch.
         beyond_tested: contacts compressed further than the paper's tests (eta_p eps > 0.67), on either side.
@@ -61,7 +125,7 @@ class Compaction(NamedTuple):
 
 class _Attempt(NamedTuple):
     state: State
-    settled: Settled
+    settled: Equilibrium
     converged: bool
     complete: bool
     spring: float
@@ -75,19 +139,14 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
     """A state to start a compaction from: overlaps pushed apart, all contacts virgin.
 
     Steps of steepest descent on the contacts' energy, implicit and so of any length (a proximal spring of 0.3 of the
-    mean stiffness), until the contacts carry next to nothing or the passes are used up. Below random close packing
-    hardly an overlap is left; above it, what is left is where the compaction begins. What contacts went through here is
-    forgotten. Scatter the spheres first (`scattered`) and lower them into the die.
+    mean stiffness), until the contacts carry next to nothing or the passes are used up. Above random close packing what
+    overlap is left is where the compaction begins. Scatter the spheres first (`scattered`) and lower them into the die.
 
     Args:
-        packing: the spheres.
-        walls: the walls.
+        packing, walls: the spheres and the walls.
         position: centres [m]; may overlap.
         solver: skin, tolerance and steps.
         passes: how many steps at most.
-
-    Raises:
-        InputError: as `start`.
     """
     solver = solver or Solver()
     passes = arguments.whole(passes, "passes")
@@ -96,11 +155,11 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
     k = float(jnp.mean(packing.sides.k1))
     state = start(packing, walls, position, skin)
     for _ in range(passes):
-        held = Held(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(0.3 * k))
-        settled = _settle(held, state.position, jnp.asarray(1e-3), solver.max_steps)
+        problem = Problem(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(0.3 * k))
+        settled = _find_equilibrium(problem, state.position, jnp.asarray(1e-3), solver.max_steps)
         state = eqx.tree_at(lambda s: s.position, state, settled.position)
         if _moved(state) > skin / 2:
-            state = listed(packing, state, skin)
+            state = rebuild_list(packing, state, skin)
         if float(settled.balance.scale) < 1e-4 * k * float(jnp.mean(packing.radius)):
             break
     return start(packing, walls, state.position, skin)
@@ -117,23 +176,21 @@ def compact(
     In every load step the centres settle where the contact forces f balance but for the proximal springs mu, which are
     made weaker in turn (`Solver.springs`); contacts remember only what they are at the end of the step (backward
     Euler). So each load step is a minimum of the energy of contacts and springs. A step that does not converge is
-    halved; one that still does not is taken as far as it got and its row is marked, as are the rows of springs that
-    could not be made as weak as asked for (`spring`).
+    halved; one that still does not is taken as far as it got and its row is marked, as are rows of springs not as weak
+    as asked for (`spring`).
 
     Args:
         packing: the spheres.
-        state: where to start (`relaxed`, `start`, or the end of another compaction or motion); its walls as `die` has
-            them.
+        state: where to start (`relaxed`, `start`, or the end of another compaction or motion) in a `die`.
         heights: of the top punch over the bottom one [m].
         solver: tolerances.
         tape: a list to which the load steps are appended, for `replay_compaction`.
 
     Returns:
-        The state at the end, at rest, and the rows.
+        The state at the end, at rest, and the rows; the state passed in is untouched.
 
     Raises:
-        InputError: for walls that are not a die, a height that is not positive, or a particle outside the walls. The
-            state passed in is untouched.
+        InputError: for walls that are not a die, a height that is not positive, or a particle outside the walls.
     """
     solver = solver or Solver()
     check_packing(packing)
@@ -170,46 +227,46 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     """One load step, with weaker and weaker springs, on a list of edges that is complete at its end."""
     skin = solver.skin * float(jnp.mean(packing.radius))
     if _moved(state) > skin / 2:
-        state = listed(packing, state, skin)
+        state = rebuild_list(packing, state, skin)
     walls = lowered(state.walls, jnp.asarray(height, state.position.dtype))
     squeeze = min(height / _height(state.walls), 1.0)
     guess = state.position.at[:, 2].multiply(squeeze)
     k = float(jnp.mean(packing.sides.k1))
     evaluations, reached = 0, 0.0
-    best: tuple[Held, Settled] | None = None
+    best: tuple[Problem, Equilibrium] | None = None
     for spring in solver.springs:
-        held = Held(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(spring * k))
-        settled = _settle(held, guess, jnp.asarray(solver.rtol), solver.max_steps)
+        problem = Problem(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(spring * k))
+        settled = _find_equilibrium(problem, guess, jnp.asarray(solver.rtol), solver.max_steps)
         evaluations += int(settled.steps)
         end = eqx.tree_at(lambda s: s.position, state, settled.position)
         if _moved(end) > skin / 2 and np.isfinite(settled.position).all():
-            fresh = listed(packing, end, skin)
+            fresh = rebuild_list(packing, end, skin)
             if _unlisted(packing, state.edges, fresh):
                 state = eqx.tree_at(lambda s: (s.edges, s.listed_at), state, (fresh.edges, fresh.listed_at))
-                held = eqx.tree_at(lambda h: h.edges, held, fresh.edges)
-                settled = _settle(held, settled.position, jnp.asarray(solver.rtol), solver.max_steps)
+                problem = eqx.tree_at(lambda h: h.edges, problem, fresh.edges)
+                settled = _find_equilibrium(problem, settled.position, jnp.asarray(solver.rtol), solver.max_steps)
                 evaluations += int(settled.steps)
         if not bool(settled.converged):
-            best = best or (held, settled)
+            best = best or (problem, settled)
             break
-        guess, reached, best = settled.position, spring, (held, settled)
+        guess, reached, best = settled.position, spring, (problem, settled)
     assert best is not None  # there is at least one spring
-    held, settled = best
-    edges, wall_history = _remembered(held, settled.position)
+    problem, settled = best
+    edges, wall_history = _remembered(problem, settled.position)
     end = eqx.tree_at(
         lambda s: (s.position, s.edges, s.wall_history, s.walls), state, (settled.position, edges, wall_history, walls)
     )
     moved = np.asarray(settled.position - state.position)
-    springs, top = float(held.proximal) * np.abs(moved[:, 2]).sum(), float(settled.balance.on_wall[TOP])
+    springs, top = float(problem.proximal) * np.abs(moved[:, 2]).sum(), float(settled.balance.on_wall[TOP])
     share = float(springs / top) if top > 0 else math.inf
     stroke = max(abs(height - _height(state.walls)), 1e-300)
     move = float(np.linalg.norm(moved, axis=1).max()) / stroke
     complete = reached == solver.springs[-1]
-    spring = float(held.proximal) / k
-    return _Attempt(end, settled, bool(settled.converged), complete, spring, held.proximal, evaluations, share, move)
+    spring = float(problem.proximal) / k
+    return _Attempt(end, settled, bool(settled.converged), complete, spring, problem.proximal, evaluations, share, move)
 
 
-_settle = eqx.filter_jit(settle)
+_find_equilibrium = eqx.filter_jit(find_equilibrium)
 _remembered = eqx.filter_jit(remembered)
 
 
@@ -257,3 +314,89 @@ def _height(walls: Walls) -> float:
 def _moved(state: State) -> float:
     """Furthest that a particle is from where it was when the edges were listed [m]."""
     return float(jnp.sqrt(jnp.max(jnp.sum((state.position - state.listed_at) ** 2, axis=1))))
+
+
+def lowered(walls: Walls, height: Scalar) -> Walls:
+    """The walls with the top punch at a height over the bottom one."""
+    bottom, top, barrel = cast(tuple[Plane, Plane, Cylinder], walls)
+    return bottom, eqx.tree_at(lambda w: w.point, top, bottom.point + height * bottom.normal), barrel
+
+
+def die_walls(walls: Walls) -> tuple[Plane, Plane, Cylinder]:
+    """Bottom punch, top punch and barrel; `InputError` if that is not what the walls are."""
+    kinds = tuple(type(wall) for wall in walls)
+    if kinds == (Plane, Plane, Cylinder):
+        bottom, top, barrel = cast(tuple[Plane, Plane, Cylinder], walls)
+        up = jnp.asarray([0.0, 0.0, 1.0], bottom.normal.dtype)
+        if bool(jnp.all((bottom.normal == up) & (top.normal == -up))):
+            return bottom, top, barrel
+    raise InputError("walls that are not bottom punch, top punch and barrel", remedy="Make them with `die`.")
+
+
+# ---- the load steps again --------------------------------------------------------------------------------------------
+
+
+class Replayed(NamedTuple):
+    """The load steps again, all of it differentiable but `converged`.
+
+    Attributes:
+        on_wall: force on bottom, top and barrel along their normals, summed over particles [N].
+        position: centres at the end of every load step [m].
+        edges, wall_history: the pairs and contacts with walls at the very end, with their largest overlaps.
+        residual: largest net force over the mean contact force [-].
+        proximal: sum of the proximal springs' axial forces, without sign [N].
+        converged: whether the step ended in equilibrium.
+    """
+
+    on_wall: Float[Array, "steps walls"]
+    position: Float[Array, "steps particles 3"]
+    edges: Edges
+    wall_history: WallHistory
+    residual: Float[Array, " steps"]
+    proximal: Float[Array, " steps"]
+    converged: Bool[Array, " steps"]
+
+    __repr__ = described()
+
+
+def replay_compaction(
+    packing: Packing, state: State, tape: Sequence[LoadStep], solver: Solver | None = None
+) -> Replayed:
+    """The load steps that `compact` recorded, for this packing or one like it, differentiable in both modes.
+
+    Lists of edges, heights and springs are those of the tape; the equilibria are found again, each from where the tape
+    has it, and differentiated by the implicit function theorem, history included. With a packing so different that
+    particles meet that the tape does not list, contacts are missing: compact it instead.
+
+    Args:
+        packing: the spheres, for example as a function of the law's parameters under `jax.jvp`.
+        state, tape, solver: start, load steps and solver of `compact`.
+    """
+    return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), solver or Solver())
+
+
+def stacked(tape: Sequence[LoadStep]) -> LoadStep:
+    """All load steps as one, every field with a leading axis; `InputError` if there are none."""
+    if not tape:
+        raise InputError("a compaction without load steps", remedy="Give `compact` a list as its `tape`.")
+    return stacked_lists(tape)
+
+
+def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
+    """`replay_compaction` of load steps that are `stacked`, to be traced."""
+
+    def one(carry, step):
+        previous, recorded, edges, wall_history = carry
+        edges = with_list(edges, step.key, step.i, step.j)
+        problem = Problem(packing, lowered(state.walls, step.height), edges, wall_history, previous, step.spring)
+        settled = find_equilibrium(problem, previous + (step.position - recorded), solver.rtol, solver.max_steps)
+        edges, wall_history = remembered(problem, settled.position)
+        springs = step.spring * jnp.sum(jnp.abs(settled.position[:, 2] - previous[:, 2]))
+        net = jnp.max(jnp.abs(net_force(problem, settled.position)))
+        row = (force_on_walls(problem, settled.position), settled.position, net / settled.balance.scale, springs)
+        return (settled.position, step.position, edges, wall_history), (*row, settled.converged)
+
+    before = with_list(state.edges, steps.key[0], steps.i[0], steps.j[0])
+    carry = (state.position, state.position, before, state.wall_history)
+    (_, _, edges, wall_history), (on_wall, position, residual, proximal, converged) = jax.lax.scan(one, carry, steps)
+    return Replayed(on_wall, position, edges, wall_history, residual, proximal, converged)

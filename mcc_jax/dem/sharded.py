@@ -13,20 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from .._types import Scalar
-from .edges import Edges, lengthened, widened
-from .forces import (
-    Forces,
-    Interaction,
-    Packing,
-    Vectors,
-    WallHistory,
-    bodies_of,
-    contact_forces,
-    pair_loads,
-    wall_loads,
-)
-from .walls import Walls
+from .edges import PADDING, Edges, pad_rows
+from .forces import Forces, Motion, bodies_of, contact_forces, pair_loads, wall_loads
+from .state import Packing, State, WallHistory
 
 AXIS = "shares"
 
@@ -35,7 +24,7 @@ Contacts: TypeAlias = Callable[..., tuple[Forces, Edges, WallHistory]]
 """What computes all contact forces, with the arguments of `contact_forces`."""
 
 
-def divided[Moving: eqx.Module](
+def sharded[Moving: eqx.Module](
     loop: Callable[..., tuple[Moving, Any]],
     devices: Devices | None,
     packing: Packing,
@@ -45,18 +34,15 @@ def divided[Moving: eqx.Module](
 ) -> tuple[Moving, Any]:
     """A loop over time steps with its contacts divided over devices; differentiable like the loop itself.
 
-    Edges, sorted by key, are dealt out in contiguous shares of equal length, and contacts with walls by particle. What
-    belongs to particles (positions, velocities, the packing) is on every device, and every device moves all of them.
-    A step needs one reduction, of one array of forces, torques and forces on walls.
+    Edges, sorted by key, are divided in contiguous shares of equal length, and contacts with walls by particle. What
+    belongs to particles (positions, velocities, the packing) is on every device, and every device moves all of them. A
+    step needs one reduction, of one array of forces, torques and forces on walls.
 
     Args:
-        loop: called with what computes the contact forces, then the packing, motion, state, and what is further. It
-            returns the state, and anything that is the same on all devices.
+        loop: called with what computes the contact forces, then packing, motion, state, and what is further. It returns
+            the state, and anything that is the same on all devices.
         devices: those of one process or, after `jax.distributed.initialize`, of all. None: no division.
-        packing: the spheres.
-        motion: how they move.
-        state: holds `edges` and `wall_history`.
-        further: numbers for the loop.
+        packing, motion, state, further: what the loop takes.
     """
     if devices is None:
         return loop(contact_forces, packing, motion, state, *further)
@@ -64,7 +50,7 @@ def divided[Moving: eqx.Module](
     lengths = [x.shape[0] for x in _remembered(state)]
     whole, share = PartitionSpec(), PartitionSpec(AXIS)
     padded = _padded(state, len(devices))
-    specs = eqx.tree_at(_dealt, jax.tree.map(lambda _: whole, padded), (share,) * len(_dealt(padded)))
+    specs = eqx.tree_at(_sharded_leaves, jax.tree.map(lambda _: whole, padded), (share,) * len(_sharded_leaves(padded)))
 
     def one_share(packing: Packing, motion: eqx.Module, state: Moving, *further: jax.Array) -> tuple[Moving, Any]:
         # Marked once, outside the loop: its derivative is then summed over devices once, not in every step.
@@ -78,13 +64,13 @@ def divided[Moving: eqx.Module](
     kept = [
         jax.lax.with_sharding_constraint(x[:n], everywhere) for x, n in zip(_remembered(moved), lengths, strict=True)
     ]
-    return eqx.tree_at(_dealt, moved, (*_dealt(state)[:3], *kept)), rest
+    return eqx.tree_at(_sharded_leaves, moved, (*_sharded_leaves(state)[:3], *kept)), rest
 
 
-def at_home[Moving: eqx.Module](
+def gathered[Moving: eqx.Module](
     run: Callable[..., tuple[Moving, Any]], devices: Devices | None, *arguments: Any
 ) -> tuple[Moving, Any]:
-    """Call a compiled `divided` loop with values of this process and bring what it returns back to this process.
+    """Call a compiled `sharded` loop with values of this process and bring what it returns back to this process.
 
     Neighbour lists are made on the host, by every process for itself and all alike.
     """
@@ -94,7 +80,7 @@ def at_home[Moving: eqx.Module](
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), run(tuple(devices), *given))
 
 
-def _dealt(state: Any) -> tuple[jax.Array, ...]:
+def _sharded_leaves(state: Any) -> tuple[jax.Array, ...]:
     """What is dealt out, one row an edge or a particle."""
     return (state.edges.key, state.edges.i, state.edges.j, *_remembered(state))
 
@@ -106,35 +92,23 @@ def _remembered(state: Any) -> tuple[jax.Array, ...]:
 
 def _padded(state: Any, parts: int) -> Any:
     """The state with as many edges, and rows of contacts with walls, as divide among the parts."""
-    edges, history = state.edges, state.wall_history
-    room, rows = (parts * math.ceil(n / parts) for n in (edges.capacity, history.slip.shape[0]))
-    longer = widened(edges, room), lengthened(history, rows)
-    return eqx.tree_at(lambda s: (s.edges, s.wall_history), state, longer)
+    key, *others = _sharded_leaves(state)
+    longer = (pad_rows(x, parts * math.ceil(len(x) / parts)) for x in others)
+    return eqx.tree_at(_sharded_leaves, state, (pad_rows(key, parts * math.ceil(len(key) / parts), PADDING), *longer))
 
 
-def _share_of_contacts(
-    packing: Packing,
-    _: Packing,
-    interaction: Interaction,
-    walls: Walls,
-    position: Vectors,
-    velocity: Vectors,
-    spin: Vectors,
-    edges: Edges,
-    history: WallHistory,
-    time_step: Scalar,
-) -> tuple[Forces, Edges, WallHistory]:
+def _share_of_contacts(packing: Packing, _: Packing, motion: Motion, state: State) -> tuple[Forces, Edges, WallHistory]:
     """`contact_forces` on one device of several, which holds a share of the edges and of the contacts with walls."""
-    motion = jax.lax.pcast((position, velocity, spin), AXIS, to="varying")
-    bodies = bodies_of(packing, *motion)
-    loads, edges = pair_loads(interaction, bodies, edges, time_step)
-    particles, rows = loads.shape[0], history.slip.shape[0]
+    moving = jax.lax.pcast((state.position, state.velocity, state.spin), AXIS, to="varying")
+    bodies = bodies_of(packing, *moving)
+    loads, edges = pair_loads(motion, bodies, state.edges)
+    particles, rows = loads.shape[0], state.wall_history.slip.shape[0]
     own = jax.lax.axis_index(AXIS) * rows + jnp.arange(rows)
     index = jnp.minimum(own, particles - 1)
     # The last share may be short: a radius below zero touches nothing.
     some = jax.tree.map(lambda x: x[index], bodies)
     some = eqx.tree_at(lambda b: b.radius, some, jnp.where(own < particles, some.radius, -1.0))
-    at_walls, on_wall, history = wall_loads(interaction, walls, some, history, time_step)
+    at_walls, on_wall, history = wall_loads(motion, state.walls, some, state.wall_history)
     loads = loads.at[index].add(at_walls)
     loads = jax.lax.psum(jnp.concatenate([loads, jnp.pad(on_wall, ((0, 0), (0, 3)))]), AXIS)
     forces = Forces(loads[:particles, :3], loads[:particles, 3:], loads[particles:, :3])

@@ -10,7 +10,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float
 
 from .. import arguments
 from .._archive import encode, read_archive
@@ -19,26 +20,65 @@ from .._format import described
 from .._store import write_file
 from .._types import Scalar
 from .edges import Edges, carry_history, close_pairs, list_edges
-from .forces import Packing, Vectors, WallHistory
+from .side import HalfContact
 from .walls import Walls
 
 SPARE = 1.1
-"""Room in the list of edges beyond the pairs found when it was made."""
+"""Length of a new list of edges over the pairs found."""
+
+Vectors = Float[Array, "particles 3"]
+
+
+class Packing(eqx.Module):
+    """Spheres, and how each of them pushes back.
+
+    Attributes:
+        radius: [m].
+        mass: [kg].
+        sides: half contacts, one a particle (``jax.vmap(half_contact)``).
+    """
+
+    radius: Float[Array, " particles"]
+    mass: Float[Array, " particles"]
+    sides: HalfContact
+
+    __repr__ = described(radius="m", mass="kg")
+
+    @property
+    def volume(self) -> Scalar:
+        """Volume of all spheres [m^3], overlaps not taken off."""
+        return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
+
+
+class WallHistory(eqx.Module):
+    """What the contacts with walls remember: dense, one place for each particle and wall.
+
+    Attributes:
+        overlap_max: largest overlap so far [m].
+        slip: elastic tangential displacement of the wall against the particle's surface [m].
+    """
+
+    overlap_max: Float[Array, "particles walls"]
+    slip: Float[Array, "particles walls 3"]
+
+    __repr__ = described()
+
+    @classmethod
+    def virgin(cls, particles: int, walls: int, dtype: DTypeLike = jnp.float64) -> WallHistory:
+        """Nothing has touched yet."""
+        return cls(jnp.zeros((particles, walls), dtype), jnp.zeros((particles, walls, 3), dtype))
 
 
 class State(eqx.Module):
     """Everything that moves or remembers. Saved and loaded whole (`save_state`), it goes on bit for bit.
 
     Attributes:
-        position: centres [m].
-        velocity: of the centres [m/s].
+        position, velocity: of the centres [m, m/s].
         spin: angular velocities [rad/s].
-        edges: pairs and their history.
-        wall_history: history of contacts with walls.
+        edges, wall_history: pairs and contacts with walls, with their history.
         walls: the walls, where they are now.
-        listed_at: positions when the list of edges was made [m].
-        skin: extra distance up to which pairs were listed then [m].
-        time: [s].
+        listed_at, skin: positions when the list of edges was made, and extra distance up to which pairs were listed
+        [m]. time: [s].
     """
 
     position: Vectors
@@ -58,15 +98,14 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
     """A state at rest: virgin contacts, a fresh list of edges.
 
     Args:
-        packing: the spheres.
-        walls: the walls.
+        packing, walls: the spheres and the walls.
         position: centres [m].
         skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
-        capacity: room for edges; a tenth more than there are pairs if None.
+        capacity: length of the list of edges; a tenth more than there are pairs if None.
 
     Raises:
-        InputError: if a position is not finite, a particle is outside the walls, a half contact resists nothing, or
-            the pairs do not fit the capacity.
+        InputError: if a position is not finite, a particle is outside the walls, a half contact resists nothing, or the
+            pairs do not fit the capacity.
     """
     check_packing(packing)
     position = arguments.values(position, "position", shape="centres [m], shape (N, 3)")
@@ -86,20 +125,16 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
         jnp.zeros((), dtype),
     )
     check_state(state)
-    return listed(packing, state, skin, capacity)
+    return rebuild_list(packing, state, skin, capacity)
 
 
-def listed(packing: Packing, state: State, skin: float, capacity: int | None = None) -> State:
-    """The state with a fresh list of edges; contacts keep their history.
+def rebuild_list(packing: Packing, state: State, skin: float, capacity: int | None = None) -> State:
+    """The state with a fresh list of edges, also where that of the given one is stale; contacts keep their history.
 
     Args:
-        packing: the spheres.
-        state: any state, also one whose list is stale.
         skin: as in `start`.
-        capacity: room for edges; if None that of the present list, or a tenth more than the pairs if they do not fit.
-
-    Raises:
-        InputError: as `close_pairs`, and if the pairs do not fit a capacity that was asked for.
+        capacity: length of the list; if None that of the present list, or a tenth more than the pairs if they do not
+            fit.
     """
     skin = arguments.number(skin, "skin [m]", least=0)
     if capacity is not None:
@@ -117,11 +152,7 @@ def listed(packing: Packing, state: State, skin: float, capacity: int | None = N
 
 
 def check_packing(packing: Packing) -> None:
-    """Refuse half contacts that resist nothing.
-
-    Raises:
-        InputError: naming the first such particle.
-    """
+    """Refuse half contacts that resist nothing, naming the first such particle."""
     valid = np.asarray(jax.vmap(lambda side: side.is_valid)(packing.sides))
     valid = valid & np.asarray((packing.radius > 0) & (packing.mass > 0))
     if not valid.all():
@@ -137,12 +168,8 @@ def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
 
 
 def check_state(state: State) -> None:
-    """Refuse a state that has gone astray.
-
-    Raises:
-        InputError: if a position is not finite or a particle's centre is behind a wall; it names particle and wall.
-    """
-    lost, behind = (np.asarray(x) for x in _astray(state))
+    """Refuse a state in which a position is not finite or a centre is behind a wall, naming particle and wall."""
+    lost, behind = (np.asarray(x) for x in _escaped(state))
     if lost.any():
         raise InputError(
             f"the position of particle {np.flatnonzero(lost)[0]} is not finite at {float(state.time):.6g} s",
@@ -158,7 +185,7 @@ def check_state(state: State) -> None:
 
 
 @jax.jit
-def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls particles"]]:
+def _escaped(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls particles"]]:
     """Which particles are nowhere, and which are behind which wall."""
     behind = [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
     lost = ~jnp.all(jnp.isfinite(state.position), axis=1)
@@ -178,11 +205,7 @@ def save_state(path: str | Path, packing: Packing, state: State) -> None:
 
 
 def load_state(path: str | Path) -> tuple[Packing, State]:
-    """What `save_state` wrote.
-
-    Raises:
-        InputError: if the file is missing, damaged, of another version, or of something else.
-    """
+    """What `save_state` wrote; `InputError` if the file is missing, damaged, or of something else."""
     path = arguments.file_path(path, "path")
     match read_archive(path):
         case (Packing() as packing, State() as state):

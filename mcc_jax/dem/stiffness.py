@@ -11,19 +11,20 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float, Int
 
-from .._numerics import shared
+from .._numerics import recompute
 from .._types import Scalar
 from .edges import Edges
-from .forces import Packing, Vectors, WallHistory, overlap_and_normal
+from .forces import overlap_and_normal
 from .pair import largest_overlap, pair_energy, pair_force, wall_energy, wall_force
 from .side import HalfContact, sides_of
+from .state import Packing, Vectors, WallHistory
 from .walls import Walls
 
 DENSE = 1200
 """Unknowns up to which stiffness matrices are factorised; above, conjugate gradients."""
 
 
-class Held(eqx.Module):
+class Problem(eqx.Module):
     """What stays as it is while the centres find their equilibrium.
 
     Attributes:
@@ -77,11 +78,9 @@ class Stiffness(eqx.Module):
         return self.alone.at[self.i].add(self.pairs).at[self.j].add(self.pairs)
 
     def solve(self, load: Vectors, *, definite: bool) -> Vectors:
-        """Displacements under a load on every particle; NaN where the matrix cannot be factorised.
+        """Displacements under a load [N] on every particle; NaN where the matrix cannot be factorised.
 
-        Args:
-            load: [N].
-            definite: whether to take it for positive definite, for the dense factorisation: half the work.
+        `definite`: whether to take the matrix for positive definite, for the dense factorisation: half the work.
         """
         n = self.alone.shape[0]
         if 3 * n <= DENSE:
@@ -106,7 +105,7 @@ class Balance(eqx.Module):
         net: force on every particle, proximal spring included [N].
         scale: mean force of the contacts that carry one, 0 if none does [N].
         stiffness: of the net force.
-        material: the same without what the forces do by turning; never has a negative eigenvalue.
+        material: the same without what the forces do by turning (geometric stiffness); never has a negative eigenvalue.
         on_wall: force on each wall along its normal [N].
     """
 
@@ -118,65 +117,67 @@ class Balance(eqx.Module):
     on_wall: Float[Array, " walls"]
 
 
-def net_force(held: Held, position: Vectors) -> Vectors:
+def net_force(problem: Problem, position: Vectors) -> Vectors:
     r"""Force on every particle [N], :math:`f(x) - \mu (x - x_{prev})`.
 
     Contacts load where the overlap is above the largest so far and unload below: backward Euler in the history.
     Differentiable in everything.
     """
-    edges = held.edges
-    i, j, overlap, normal = _pairs(held, position)
+    edges = problem.edges
+    i, j, overlap, normal = _pairs(problem, position)
     force = jax.lax.optimization_barrier(jax.vmap(pair_force)(i, j, edges.overlap_max, overlap))
     push = force[:, None] * normal
-    against, inward = _on_walls(held, position)
-    total = -held.proximal * (position - held.previous) + jnp.sum(against[:, :, None] * inward, axis=0)
+    against, inward = _on_walls(problem, position)
+    total = -problem.proximal * (position - problem.previous) + jnp.sum(against[:, :, None] * inward, axis=0)
     return total.at[edges.j].add(push).at[edges.i].add(-push)
 
 
-def balance(held: Held, position: Vectors) -> Balance:
+def balance(problem: Problem, position: Vectors) -> Balance:
     """Energy, net force and stiffness; not meant to be differentiated."""
-    packing, edges, peak = held.packing, held.edges, held.wall_history.overlap_max.T
-    i, j, overlap, normal = _pairs(held, position)
+    packing, edges, peak = problem.packing, problem.edges, problem.wall_history.overlap_max.T
+    i, j, overlap, normal = _pairs(problem, position)
     force, slope = _with_slope(lambda x: jax.vmap(pair_force)(i, j, edges.overlap_max, x), overlap)
-    moved = position - held.previous
-    energy = 0.5 * held.proximal * jnp.sum(moved**2) + _work(jax.vmap(pair_energy)(i, j, edges.overlap_max, overlap))
+    moved = position - problem.previous
+    energy = 0.5 * problem.proximal * jnp.sum(moved**2) + _work(jax.vmap(pair_energy)(i, j, edges.overlap_max, overlap))
     push = force[:, None] * normal
     distance = packing.radius[edges.i] + packing.radius[edges.j] - overlap
     along = normal[:, :, None] * normal[:, None, :]
 
-    inward, wall_overlap = _wall_geometry(held, position)
+    inward, wall_overlap = _wall_geometry(problem, position)
     against, steepness = _with_slope(lambda x: _each_wall(wall_force)(packing.sides, peak, x), wall_overlap)
     energy = energy + _work(_each_wall(wall_energy)(packing.sides, peak, wall_overlap))
-    bend = jnp.stack([jax.vmap(jax.hessian(wall.distance))(position) for wall in held.walls])
+    bend = jnp.stack([jax.vmap(jax.hessian(wall.distance))(position) for wall in problem.walls])
     facing = inward[:, :, :, None] * inward[:, :, None, :]
     identity = jnp.eye(3, dtype=position.dtype)[None]
-    springs = held.proximal * identity
-    turning = shared(force / distance)[:, None, None] * (identity - along)
+    springs = problem.proximal * identity
+    geometric = recompute(force / distance)[:, None, None] * (identity - along)
 
-    def pressing(slope: Array, steepness: Array) -> tuple[Array, Array]:
+    def material(slope: Array, steepness: Array) -> tuple[Array, Array]:
         return slope[:, None, None] * along, springs + jnp.sum(steepness[:, :, None, None] * facing, axis=0)
 
     carrying = (jnp.sum(force > 0) + jnp.sum(against > 0)).astype(force.dtype)
-    pairs, alone = pressing(slope, steepness)
-    soft_pairs, soft_alone = pressing(jnp.maximum(slope, 0.0), jnp.maximum(steepness, 0.0))
-    net = -held.proximal * moved + jnp.sum(against[:, :, None] * inward, axis=0)
+    pairs, alone = material(slope, steepness)
+    soft_pairs, soft_alone = material(jnp.maximum(slope, 0.0), jnp.maximum(steepness, 0.0))
+    net = -problem.proximal * moved + jnp.sum(against[:, :, None] * inward, axis=0)
     return Balance(
         energy,
         net.at[edges.j].add(push).at[edges.i].add(-push),
-        shared((jnp.sum(force) + jnp.sum(against)) / jnp.maximum(carrying, 1.0)),
-        Stiffness(pairs - turning, alone - jnp.sum(against[:, :, None, None] * bend, axis=0), edges.i, edges.j),
+        recompute((jnp.sum(force) + jnp.sum(against)) / jnp.maximum(carrying, 1.0)),
+        Stiffness(pairs - geometric, alone - jnp.sum(against[:, :, None, None] * bend, axis=0), edges.i, edges.j),
         Stiffness(soft_pairs, soft_alone, edges.i, edges.j),
         jnp.sum(against, axis=1),
     )
 
 
-def remembered(held: Held, position: Vectors) -> tuple[Edges, WallHistory]:
+def remembered(problem: Problem, position: Vectors) -> tuple[Edges, WallHistory]:
     """The largest overlaps after a load step that ended at these centres."""
-    overlap, _ = pair_geometry(held.packing.radius, position, held.edges)
-    _, wall_overlap = _wall_geometry(held, position)
-    edges = eqx.tree_at(lambda e: e.overlap_max, held.edges, jax.vmap(largest_overlap)(held.edges.overlap_max, overlap))
-    peak = jax.vmap(jax.vmap(largest_overlap))(held.wall_history.overlap_max, wall_overlap.T)
-    return edges, eqx.tree_at(lambda h: h.overlap_max, held.wall_history, peak)
+    overlap, _ = pair_geometry(problem.packing.radius, position, problem.edges)
+    _, wall_overlap = _wall_geometry(problem, position)
+    edges = eqx.tree_at(
+        lambda e: e.overlap_max, problem.edges, jax.vmap(largest_overlap)(problem.edges.overlap_max, overlap)
+    )
+    peak = jax.vmap(jax.vmap(largest_overlap))(problem.wall_history.overlap_max, wall_overlap.T)
+    return edges, eqx.tree_at(lambda h: h.overlap_max, problem.wall_history, peak)
 
 
 def pair_geometry(radius: Float[Array, " particles"], position: Vectors, edges: Edges) -> tuple[Array, Array]:
@@ -185,30 +186,30 @@ def pair_geometry(radius: Float[Array, " particles"], position: Vectors, edges: 
     return jax.vmap(overlap_and_normal)(position[i], position[j], radius[i] + radius[j], edges.active)
 
 
-def force_on_walls(held: Held, position: Vectors) -> Float[Array, " walls"]:
+def force_on_walls(problem: Problem, position: Vectors) -> Float[Array, " walls"]:
     """Force on each wall along its normal [N], all particles added up; differentiable."""
-    return jnp.sum(_on_walls(held, position)[0], axis=1)
+    return jnp.sum(_on_walls(problem, position)[0], axis=1)
 
 
-def _pairs(held: Held, position: Vectors) -> tuple[HalfContact, HalfContact, Array, Array]:
+def _pairs(problem: Problem, position: Vectors) -> tuple[HalfContact, HalfContact, Array, Array]:
     """Both sides, overlap and normal of every edge."""
-    sides = (sides_of(held.packing.sides, k) for k in (held.edges.i, held.edges.j))
-    return jax.lax.optimization_barrier((*sides, *pair_geometry(held.packing.radius, position, held.edges)))
+    sides = (sides_of(problem.packing.sides, k) for k in (problem.edges.i, problem.edges.j))
+    return jax.lax.optimization_barrier((*sides, *pair_geometry(problem.packing.radius, position, problem.edges)))
 
 
 def _on_walls(
-    held: Held, position: Vectors
+    problem: Problem, position: Vectors
 ) -> tuple[Float[Array, "walls particles"], Float[Array, "walls particles 3"]]:
-    inward, overlap = _wall_geometry(held, position)
-    force = _each_wall(wall_force)(held.packing.sides, held.wall_history.overlap_max.T, overlap)
+    inward, overlap = _wall_geometry(problem, position)
+    force = _each_wall(wall_force)(problem.packing.sides, problem.wall_history.overlap_max.T, overlap)
     return jax.lax.optimization_barrier(force), inward
 
 
-def _wall_geometry(held: Held, position: Vectors) -> tuple[Array, Array]:
+def _wall_geometry(problem: Problem, position: Vectors) -> tuple[Array, Array]:
     """Inward normals (walls, particles, 3) and overlaps (walls, particles)."""
-    found = [jax.vmap(jax.value_and_grad(wall.distance))(position) for wall in held.walls]
+    found = [jax.vmap(jax.value_and_grad(wall.distance))(position) for wall in problem.walls]
     distance, inward = (jnp.stack(x) for x in zip(*found, strict=True))
-    return jax.lax.optimization_barrier((inward, held.packing.radius[None] - distance))
+    return jax.lax.optimization_barrier((inward, problem.packing.radius[None] - distance))
 
 
 def _each_wall(function: Callable[..., Any]) -> Callable[..., Any]:

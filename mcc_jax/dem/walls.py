@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from .._numerics import shared
+from .._numerics import recompute
 from .._types import Scalar, scalar
 
 Vector = Float[Array, " 3"]
@@ -88,7 +88,7 @@ class Cylinder(eqx.Module):
         """Direction in which the wall pushes a particle there: towards the axis."""
         flat = jnp.stack([position[0], position[1], jnp.zeros_like(position[2])])
         length = _length(position[:2])
-        return -flat * shared(1 / jnp.where(length > 0, length, 1.0))
+        return -flat * recompute(1 / jnp.where(length > 0, length, 1.0))
 
     def moved(self, time: Scalar) -> Cylinder:
         """The wall after that time [s]."""
@@ -102,11 +102,7 @@ Walls: TypeAlias = tuple[Wall, ...]
 def die(radius: float, height: float, dtype: DTypeLike = jnp.float64) -> Walls:
     """A closed die: bottom punch at z = 0, top punch at the height, cylinder between them with its rim at the height.
 
-    Returns:
-        (bottom, top, cylinder), at rest; give them velocities with `set_velocity`.
-
-    Raises:
-        InputError: if a size is not positive.
+    (bottom, top, cylinder), at rest; give them velocities with `set_velocity`.
     """
     radius = arguments.number(radius, "the radius of a die [m]", above=0)
     height = arguments.number(height, "the height of a die [m]", above=0)
@@ -123,11 +119,7 @@ def die(radius: float, height: float, dtype: DTypeLike = jnp.float64) -> Walls:
 
 
 def set_velocity(walls: Walls, velocity: Any) -> Walls:
-    """The walls with these velocities [m/s].
-
-    Raises:
-        InputError: if there are not three components for every wall.
-    """
+    """The walls with these velocities [m/s], three components for every wall."""
     velocity = arguments.values(velocity, "velocity", shape="three components [m/s] for every wall")
     if velocity.shape != (len(walls), 3):
         raise InputError(f"velocity has the shape {velocity.shape} where ({len(walls)}, 3) is expected")
@@ -145,4 +137,4 @@ def dot(one: Vector, other: Vector) -> Scalar:
 def _length(vector: Float[Array, " 2"]) -> Scalar:
     """Length with a finite derivative at zero."""
     square = vector[0] * vector[0] + vector[1] * vector[1]
-    return jnp.where(square > 0, shared(jnp.sqrt(jnp.where(square > 0, square, 1.0))), 0.0)
+    return jnp.where(square > 0, recompute(jnp.sqrt(jnp.where(square > 0, square, 1.0))), 0.0)

@@ -7,15 +7,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
 from .._format import described
+from .._numerics import compiled_whole
 from ..dem import HalfContact, half_contact
-from ..formulas import Formulas, recovery_limit
-from ..formulas.recovery_limit import SHARE
+from ..formulas import Contact, Formulas
+from ..formulas.contact import SHARE
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, stress_ratio
 from ..law.response import folded
@@ -43,7 +46,7 @@ class CurveTables:
             `recovered_strain_at_eta_1`, the strain that a particle of shape factor 1 recovers from there, and
             `recovered_strain_formula_at_eta_1`, the same without its limit. Of another shape factor a particle recovers
             the latter times eta_p^((1 - p)/2), and at most the smaller of `scaled_strain` and (3 pi/8) `stress_MPa` /
-            `tangent_MPa` (where that is positive), over eta_p: so no unloading gains energy (`law.recovery_limit`).
+            `tangent_MPa` (where that is positive), over eta_p: so no unloading gains energy (`recoverable_strain`).
         unloading: `recovered_share` s and `stress_share` g(s) of the peak stress.
         error: largest error of linear interpolation, as a share of each column's largest value.
     """
@@ -99,15 +102,19 @@ def _loading(x: np.ndarray, curves: Curves) -> dict[str, np.ndarray]:
 
 def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> Curves:
     """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
-    K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
-    secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
-    tangent = K1 - x**2 * (3 * K3 - 5 * x**2 * K5)
-    n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
-    square = (secant / modulus) ** n * x ** (n - 1) / k
+    n, k = law.unloading.stress_power, law.unloading.constant
+    contact = Contact(*law.plastic.polynomial, 1 / (k * law.effective_modulus**n), power=n)
     if side is not None:
-        square *= np.asarray(side.numbers(side.tested / TESTED_STRAIN * x).c / side.c)
-    limit, _ = recovery_limit(*map(jnp.asarray, (x, secant, tangent)))
-    return secant, tangent, np.sqrt(square), np.asarray(limit)
+        ratio = side.at_peak(jnp.asarray(side.tested / TESTED_STRAIN * x)).c / side.c
+        contact = eqx.tree_at(lambda one: one.c, contact, contact.c * ratio)
+    secant, tangent, formula, limit = map(np.asarray, _curves(contact, jnp.asarray(x)))
+    return secant, tangent, formula, limit
+
+
+@compiled_whole
+def _curves(contact: Contact, x: Array) -> tuple[Array, Array, Array, Array]:
+    top, bottom, _ = contact.limit(x)
+    return contact.secant(x), contact.tangent(x), jnp.sqrt(contact.formula_squared(x)), top / bottom
 
 
 def _corners(at: Callable[[np.ndarray], Curves]) -> np.ndarray:

@@ -1,244 +1,350 @@
-"""The paper's formulas for one particle between platens: loading, unloading, recovered strain, work; no memory."""
+r"""The law of one contact, four numbers and the largest displacement so far, in any consistent units.
+
+.. math::
+    F &= k_1 \gamma - k_3 \gamma^3 + k_5 \gamma^5 && \text{loading}, \quad \gamma \ge \gamma_P \\
+    F &= F_P\, f(s), \quad s = (\gamma_P - \gamma) / \Delta && \text{unloading and reloading} \\
+    \Delta^2 &= c\, (F_P / \gamma_P)^n\, \gamma_P^{n-1} && \text{recovered on full release},
+        \quad \Delta \le \min\left(\gamma_P,\ \tfrac{3\pi}{8}\, F_P \Big/ \frac{dF}{d\gamma}\Big|_P\right)
+
+with f of `stress_ratio`. Without the limit a release could give back more than loading took, at small peaks by the
+printed form, with a soft modulus by every form. With it no cycle of any path gains energy; the proof is in the
+documentation, "The law". In a pair each side has its own limit; the sides carry one force, so energies add.
+"""
 
 from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from .._format import table, value_of
-from .._numerics import compiled_whole, derivative_kept, shared
-from .._types import Flag, Scalar, ScalarLike, Values, scalar
-from ..arguments import finite, member, positive
-from ..geometry import Particle, plastic_shape_factor
-from .branch import AREA, branch_coefficients, branch_force
-from .loading_inverse import loading_strain, secant_modulus, tangent_modulus
-from .plastic import Plastic
+from .._numerics import recompute, running_max
+from .._types import Flag, Path, Scalar, Values
+from .loading_inverse import loading_strain, loading_work, secant_modulus, tangent_modulus
 from .recovery import energy_ratio, recovery, stress_ratio
-from .recovery_limit import recovery_limit
 from .unloading import StrainScaling, Unloading
 
-AnyShape = Float[Array, "..."]
+SHARE = 3 * math.pi / 8
+r"""Largest :math:`\Delta F'/F_P`. Elastic energy is :math:`\tfrac{4}{3\pi} F_P \Delta`; with it :math:`F^2/(2F')`."""
 
 
-def _shape(value: ScalarLike) -> Scalar:
-    finite(value, "a, the geometric parameter [-],")
-    return scalar(value)
+Flags = Bool[Array, "..."]
 
 
-def _modulus(value: ScalarLike) -> Scalar:
-    positive(value, "the effective modulus [MPa]", plain=True)
-    return scalar(value)
+class Recovered(NamedTuple):
+    """What full release from a peak gives back, as a quotient top / bottom; 1 where no force was carried.
 
-
-def _unloading(value: Unloading | str) -> Unloading:
-    return member(value, Unloading, "unloading")
-
-
-def _strain_scaling(value: StrainScaling | str) -> StrainScaling:
-    return member(value, StrainScaling, "strain_scaling")
-
-
-class Formulas(eqx.Module):
-    r"""Stress, force and recovered strain of a particle at a given peak: the parameters of the law, without memory.
-
-    What stands here an effect can change through its parameters (size, shape, humidity), and `MccLaw` adds memory,
-    effects and control. Attributes and validity are those of `MccLaw`.
+    Whether the peak carries force, the recovered displacement is at its limit, and there at the second of its two
+    terms.
     """
 
-    plastic: Plastic
-    a: Scalar = eqx.field(converter=_shape)
-    effective_modulus: Scalar = eqx.field(converter=_modulus)
-    unloading: Unloading = eqx.field(static=True, converter=_unloading, default=Unloading.PRINTED)
-    strain_scaling: StrainScaling = eqx.field(static=True, converter=_strain_scaling, default=StrainScaling.RAW)
-
-    def __repr__(self) -> str:
-        return table(type(self).__name__, self._rows())
-
-    def _rows(self) -> list[tuple[str, str]]:
-        return [
-            *((name, value_of(getattr(self.plastic, name))) for name in ("C1", "C3", "C5")),
-            ("shape parameter a", value_of(self.a)),
-            ("effective modulus", value_of(self.effective_modulus, "MPa")),
-            ("unloading", f"{self.unloading.value}, strain scaling {self.strain_scaling.value}"),
-        ]
+    top: Values
+    bottom: Values
+    carries: Flags
+    limited: Flags
+    steep: Flags
 
     @property
-    def is_monotone(self) -> Flag:
-        """Whether the loading curve never falls (`Plastic.is_monotone`)."""
-        return self.plastic.is_monotone
+    def span(self) -> Values:
+        """The recovered displacement."""
+        return recompute(self.top / self.bottom)
 
     @property
-    def is_valid(self) -> Flag:
-        """Whether C1, C5 and the modulus are positive, C3 is not negative and nothing is NaN."""
-        C1, C3, C5 = self.plastic.C1, self.plastic.C3, self.plastic.C5
-        return (C1 > 0) & (C3 >= 0) & (C5 > 0) & (self.effective_modulus > 0) & jnp.isfinite(self.a)
+    def displacement(self) -> Values:
+        """The same, 0 where no force was carried."""
+        return jnp.where(self.carries, self.span, 0.0)
 
-    def carries_stress(self, particle: Particle) -> Flag:
-        """Whether the particle's shape factor is positive."""
-        return self.shape_factor(particle) > 0
 
-    def shape_factor(self, particle: Particle) -> Scalar:
-        """eta_p of the particle under this law's `a` [-]."""
-        return plastic_shape_factor(particle, self.a)
+class Contact(eqx.Module):
+    """A particle against a plane: platens (um, mN), a wall or a neighbour in a particle code (m, N).
 
-    # ---- stress and strain -------------------------------------------------------------------------------------------
+    Attributes:
+        k1, k3, k5: initial slope of loading, factors of its softening and its hardening term.
+        c: factor of the recovered displacement squared.
+        power: n, 1 for the printed unloading form and 2 for the punch forms.
+    """
 
-    @compiled_whole
-    def loading_stress(self, particle: Particle, strain: AnyShape) -> AnyShape:
-        """Stress [MPa] of plastic loading at the strain [-]."""
-        return self.plastic.stress(self.shape_factor(particle) * strain)
+    k1: Values
+    k3: Values
+    k5: Values
+    c: Values
+    power: int = eqx.field(static=True, default=1, kw_only=True)
 
-    @compiled_whole
-    def recoverable_strain(self, particle: Particle, strain_max: AnyShape) -> AnyShape:
-        r"""Strain :math:`\delta` [-] recovered on full release from the largest strain :math:`\epsilon_P` [-].
+    # ---- the law: a step, a path, and the same under load control ------------------------------------------------
 
-        .. math::
-            \delta^2 = \frac{\sigma_P}{4.12\, \bar E\, \eta_p^p\, \epsilon_P} \ (\text{printed}), \qquad
-            \delta^2 = \frac{\sigma_P^2}{k\, \bar E^2\, \eta_p^p\, \epsilon_P} \ (\text{punch forms})
+    def step(self, peak: Scalar, displacement: Scalar) -> tuple[Scalar, Scalar]:
+        """Largest displacement so far and force after one more displacement."""
+        # Asked this way round, a displacement that is NaN shows; so it is below.
+        peak = jnp.where(displacement < peak, peak, displacement)
+        return peak, self.force(peak, peak - displacement)
 
-        with p of the `StrainScaling`, and never more than a contact can give back (`recovery_limit`),
+    def path(self, peak: Scalar, displacement: Path) -> tuple[Scalar, Path]:
+        """The same along a path: the scan of `step` in closed form, over the running maximum."""
+        highest = running_max(displacement)
+        peaks = jnp.where(highest < peak, peak, highest)
+        return peaks[-1], self.force(peaks, peaks - displacement)
 
-        .. math:: \delta \le \min\left(\epsilon_P,\ \tfrac{3\pi}{8}\, \sigma_P \Big/ \frac{d\sigma}{d\epsilon}\right).
-        """
-        eta = self.shape_factor(particle)
-        _, _, recoverable = self._elastic(eta, eta * strain_max)
-        return recoverable
-
-    @compiled_whole
-    def unloading_stress(self, particle: Particle, strain: AnyShape, strain_max: AnyShape) -> AnyShape:
-        """Stress [MPa] on the elastic branch that starts at `strain_max`."""
-        eta = self.shape_factor(particle)
-        peak_stress, carries, recoverable = self._elastic(eta, eta * strain_max)
-        return peak_stress * stress_ratio(_recovered(strain_max - strain, carries, recoverable))
-
-    def recoverable_displacement(
-        self, particle: Particle, peak_displacement: Values, peak_force: Values, factor: Values | Scalar
-    ) -> Values:
-        """Displacement [um] recovered on full release from a peak, with a factor on the effective modulus.
-
-        `recoverable_strain` in terms of force and displacement at the peak, which effects may have moved off the
-        loading curve. The limit takes the slope of loading over its secant from the curve without effects, so that it
-        stays in closed form.
-        """
-        eta = self.shape_factor(particle)
-        x = eta * particle.strain(peak_displacement)
-        moved = x > jnp.finfo(x.dtype).tiny ** 0.5
-        secant = jnp.where(moved, particle.stress(peak_force), self.plastic.C1) / jnp.where(moved, x, 1.0)
-        carries, recoverable = self._recoverable(
-            eta, x, secant, self.plastic.secant(x), self.effective_modulus * factor
-        )
-        return particle.displacement(jnp.where(moved & carries, recoverable, 0.0))
-
-    def _elastic(
-        self, eta: Scalar, x: AnyShape, modulus: Scalar | None = None
-    ) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
-        """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
-        secant = secant_modulus(*self.plastic.polynomial, x)
-        modulus = self.effective_modulus if modulus is None else modulus
-        return x * secant, *self._recoverable(eta, x, secant, secant, modulus)
-
-    def _recoverable(
-        self, eta: Scalar, x: AnyShape, secant: AnyShape, loading_secant: AnyShape, modulus: AnyShape
-    ) -> tuple[Bool[Array, ...], AnyShape]:
-        """Whether the peak carries stress, and the recoverable strain, at the peak scaled strain `x`."""
-        k, power = self.unloading.constant, self.strain_scaling.power
-        if self.unloading is Unloading.PRINTED:
-            square = shared(eta ** (1 - power) * secant / (k * modulus))
-        else:
-            square = eta ** (1 - power) * x * shared(secant / modulus) ** 2 / k
-        carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
-        recoverable = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
-        tangent = tangent_modulus(*self.plastic.polynomial, x)
-        limit, _ = recovery_limit(shared(x / eta), loading_secant, tangent)
-        return carries, jnp.where(carries & (recoverable > limit), limit, recoverable)
-
-    # ---- force and displacement --------------------------------------------------------------------------------------
-
-    def force(self, particle: Particle, displacement: AnyShape, peak: AnyShape) -> AnyShape:
-        """Force [mN] at platen displacements [um], the largest up to each being `peak`."""
-        # A path then depends on its particle through four numbers only.
-        eta, diameter = derivative_kept(self.shape_factor(particle)), derivative_kept(particle.effective_diameter)
-        size = eta, diameter, particle.inverse_diameter
-        form, law = (self.unloading, self.strain_scaling), (*self.plastic.polynomial, self.effective_modulus)
-        numbers = branch_coefficients(*form, *law, *size)
-        return branch_force(self.unloading.stress_power, *numbers, peak, peak - displacement)
-
-    @compiled_whole
-    def peak_and_displacement(
-        self, particle: Particle, displacement_max: Scalar, force: AnyShape, highest: AnyShape
-    ) -> tuple[AnyShape, AnyShape]:
-        """Largest displacement so far and displacement [um] under forces [mN], one or many.
+    def under(self, displacement_max: Scalar, force: Values, highest: Values) -> tuple[Values, Values]:
+        """Largest displacement so far and displacement under forces, one or many.
 
         Args:
-            particle: the particle.
-            displacement_max: its largest displacement before the first of the forces [um].
-            force: forces [mN].
-            highest: the largest force up to each of them [mN].
+            displacement_max: the largest before the first of the forces.
+            force: the forces.
+            highest: the largest force up to each of them.
         """
         # The barriers make stages that share nothing but what they are given. Where they share intermediate values, XLA
         # stores those and cuts the loop over the data of the inverse in many pieces.
-        eta, diameter = jax.lax.optimization_barrier((self.shape_factor(particle), particle.effective_diameter))
+        contact = jax.lax.optimization_barrier(self)
+        past = jax.lax.optimization_barrier(contact.loading(displacement_max))
 
-        carried = self.plastic.stress(shared(eta * displacement_max / diameter))
-        past = jax.lax.optimization_barrier(AREA * (diameter * diameter) * carried)
-
-        law, eta, diameter, displacement_max, highest = jax.lax.optimization_barrier(
-            (self, eta, diameter, displacement_max, highest)
-        )
-        scale, area = shared(diameter / eta), AREA * (diameter * diameter)
-        stress = shared(jnp.where(highest < past, past, highest) / area)
-        K1, K3, K5 = law.plastic.polynomial
-        reached = scale * loading_strain(K1, K3, K5, stress, displacement_max / scale)
+        contact, displacement_max, highest = jax.lax.optimization_barrier((self, displacement_max, highest))
+        peak_force = jnp.where(highest < past, past, highest)
+        reached = loading_strain(contact.k1, contact.k3, contact.k5, peak_force, displacement_max)
         elastic = (highest < past) | (reached < displacement_max)
         peak = jax.lax.optimization_barrier(jnp.where(elastic, displacement_max, reached))
 
-        law, eta, diameter, force, highest = jax.lax.optimization_barrier((self, eta, diameter, force, highest))
+        contact, force, highest = jax.lax.optimization_barrier((self, force, highest))
         peak_force = jnp.where(highest < past, past, highest)
-        _, carries, recoverable = law._elastic(eta, shared(eta * peak / diameter))
+        recovered = contact.recovered(peak)
         # Below that, the quotient's derivatives overflow.
-        loaded = carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
-        ratio = shared(jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0))
-        released = diameter * recoverable * recovery(ratio)
+        loaded = recovered.carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
+        ratio = recompute(jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0))
+        released = recovered.span * recovery(ratio)
         return peak, peak - jnp.where(loaded & (force < peak_force), released, 0.0)
 
-    # ---- energy ------------------------------------------------------------------------------------------------------
+    # ---- loading -------------------------------------------------------------------------------------------------
 
-    @compiled_whole
-    def loading_work(self, particle: Particle, displacement: Scalar) -> Scalar:
-        r"""Work [nJ] of plastic loading from zero to the displacement [um].
+    def secant(self, displacement: Values) -> Values:
+        """Loading force over displacement, never below zero."""
+        return secant_modulus(self.k1, self.k3, self.k5, displacement)
 
-        .. math:: W = \frac{\pi R_e^2 D_e}{\eta_p}
-            \left(\tfrac12 C_1 x^2 - \tfrac14 C_3^3 x^4 + \tfrac16 C_5^5 x^6\right), \quad x = \eta_p \gamma / D_e
+    def tangent(self, displacement: Values) -> Values:
+        """Slope of loading."""
+        return tangent_modulus(self.k1, self.k3, self.k5, displacement)
+
+    def loading(self, displacement: Values) -> Values:
+        """Force of loading."""
+        return displacement * self.secant(displacement)
+
+    def work(self, displacement: Values) -> Values:
+        """Work of loading."""
+        return loading_work(self.k1, self.k3, self.k5, displacement)
+
+    @property
+    def is_monotone(self) -> Flag:
+        r"""Whether the force never falls while displacement grows: :math:`9 k_3^2 \le 20 k_1 k_5`.
+
+        Where it falls the split of a pair is not unique. About 2.4 % of the paper's log-normal draws do.
         """
-        eta = self.shape_factor(particle)
-        density = self.plastic.work(eta * particle.strain(displacement)) / eta
-        return particle.force(density) * particle.effective_diameter
+        return 9 * self.k3 * self.k3 <= 20 * self.k1 * self.k5
 
-    def recoverable_work(
-        self, particle: Particle, peak: Scalar, displacement: Scalar, factor: Scalar | None = None
-    ) -> tuple[Scalar, Scalar]:
-        r"""What full release gives back [nJ]: from the peak, and from a displacement on its branch.
+    # ---- unloading -----------------------------------------------------------------------------------------------
 
-        .. math:: W_{rec} = \pi R_e^2 D_e\, \sigma_P\, \delta\, g(s), \quad g(0) = \tfrac{4}{3\pi}
+    def softened(self, factor: Values | Scalar) -> Contact:
+        """The bare contact with a factor on its effective modulus."""
+        return Contact(self.k1, self.k3, self.k5, self.c / factor**self.power, power=self.power)
+
+    @property
+    def bare(self) -> Contact:
+        """The four numbers alone, of a kind of contact that has more."""
+        return Contact(self.k1, self.k3, self.k5, self.c, power=self.power)
+
+    def recovered(self, peak: Values, secant: Values | None = None) -> Recovered:
+        """What full release from a peak displacement gives back.
+
+        The secant is force over displacement there, if effects moved it off the curve of loading; the limit stays that
+        of the curve.
+        """
+        square = self.formula_squared(peak, secant)
+        tiny = jnp.finfo(peak.dtype).tiny  # down to where the root still has a derivative
+        carries = (self.loading(peak) > tiny) & (square > tiny)
+        formula = recompute(jnp.sqrt(jnp.where(carries, square, 1.0)))
+        top, bottom, steep = self.limit(peak)
+        limited = carries & (formula * bottom > top)
+        top, bottom = jnp.where(limited, top, formula), jnp.where(limited, bottom, 1.0)
+        return Recovered(jnp.where(carries, top, 1.0), bottom, carries, limited, steep)
+
+    def formula_squared(self, peak: Values, secant: Values | None = None) -> Values:
+        """Square of the recovered displacement by its formula, without the limit."""
+        secant = self.secant(peak) if secant is None else secant
+        return self.c * secant if self.power == 1 else self.c * secant * secant * peak
+
+    def limit(self, peak: Values) -> tuple[Values, Values, Flags]:
+        """The limit of the recovered displacement as a quotient, and whether the second of its terms holds."""
+        secant, tangent = self.secant(peak), self.tangent(peak)
+        steep = tangent > SHARE * secant
+        return jnp.where(steep, peak * secant, peak), jnp.where(steep, tangent * (1 / SHARE), 1.0), steep
+
+    def growth(self, peak: Values, per_span: Values, limited: Flags, steep: Flags) -> tuple[Values, ...]:
+        r"""Factors of the changes of :math:`F_P`, of :math:`\gamma_P` times :math:`F_P/\gamma_P`, of the slope T of
+        loading and of c in
+
+        .. math:: 2 F_P\, d\Delta / \Delta = n\, dF_P - (F_P/\gamma_P)\, d\gamma_P + F_P\, dc/c \ (\text{formula}),
+            \quad 2\, (F_P/\gamma_P)\, d\gamma_P, \quad 2\, dF_P - 2 (F_P/T)\, dT \ (\text{limits}).
+        """
+        secant = self.secant(peak)
+        over_c = secant * per_span * per_span * (1.0 if self.power == 1 else peak * secant)  # by products
+        return (
+            jnp.where(limited, jnp.where(steep, 2.0, 0.0), float(self.power)),
+            jnp.where(limited, jnp.where(steep, 0.0, 2.0), -1.0),
+            jnp.where(limited & steep, -2 / SHARE * recompute(1 / per_span), 0.0),
+            jnp.where(limited, 0.0, peak * secant * over_c),
+        )
+
+    def force(self, peak: Values, drop: Values) -> Values:
+        r"""Force after the displacement dropped from its peak; zero where no force was carried there.
+
+        Derivatives are written out, because reverse mode then stores half as many arrays along a path. With
+        :math:`h = -\tfrac12 s f'`:
+
+        .. math:: dF = f\, dF_P + (F_P / \Delta) f'\, d(drop) + h\, (2 F_P\, d\Delta / \Delta) \quad (`growth`).
 
         Args:
-            particle: the particle.
-            peak: its largest displacement [um].
-            displacement: where it is now [um].
-            factor: on the effective modulus.
+            peak: largest displacement so far.
+            drop: how far the displacement is below it, >= 0; 0 is loading, with the derivative of loading.
         """
-        diameter = particle.effective_diameter
-        eta = self.shape_factor(particle)
-        modulus = self.effective_modulus if factor is None else factor * self.effective_modulus
-        peak_stress, carries, recoverable = self._elastic(eta, eta * peak / diameter, modulus)
-        s = _recovered((peak - displacement) / diameter, carries, recoverable)
-        scale = particle.force(peak_stress) * diameter * jnp.where(carries, recoverable, 0.0)
-        at_peak = scale * energy_ratio(jnp.zeros_like(s))
-        return at_peak, jnp.where(displacement >= peak, at_peak, scale * energy_ratio(s))
+        return _force(self.bare, peak, drop)
+
+    def stored(self, peak: Values, drop: Values) -> tuple[Values, Values]:
+        """What full release gives back: from the peak, and after the displacement dropped from it."""
+        return stored(self.loading(peak), self.recovered(peak).span, drop)
 
 
-def _recovered(drop: AnyShape, carries: Bool[Array, ...], recoverable: AnyShape) -> AnyShape:
-    """Share of the recoverable strain recovered after the strain dropped; all of it where no stress was carried."""
-    return jnp.where(carries, drop / recoverable, 1.0)
+def stored(force: Values, span: Values, drop: Values) -> tuple[Values, Values]:
+    r"""Elastic energy :math:`F_P\, \Delta\, g(s)` (`energy_ratio`) of a peak force, at s = 0 and after a drop."""
+    s = recompute(drop / span)
+    scale = jnp.where(force > 0, force * span, 0.0)
+    at_peak = scale * energy_ratio(jnp.zeros_like(s))
+    return at_peak, jnp.where(drop <= 0, at_peak, scale * energy_ratio(s))
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def _force(contact: Contact, peak: Values, drop: Values) -> Values:
+    force, _, _, _, ratio = _branch(contact, peak, drop)
+    return force * ratio
+
+
+@_force.defjvp
+def _force_jvp(primals: Any, tangents: Any) -> tuple[Values, Values]:
+    contact, peak, _ = primals
+    change, dpeak, ddrop = tangents
+    force, recovered, per_span, s, ratio = _branch(*primals)
+    # The force and all derivatives need these: without a barrier XLA computes them again in the loop of each output.
+    s, ratio, per_span = jax.lax.optimization_barrier((s, ratio, per_span))
+    secant, tangent, square = contact.secant(peak), contact.tangent(peak), peak * peak
+    s, fall = falling(s)
+    h = 0.5 * s * fall
+    with_force, with_peak, with_slope, with_c = contact.growth(peak, per_span, recovered.limited, recovered.steep)
+    by_force, by_slope = jnp.where(secant > 0, ratio + with_force * h, 0.0), h * with_slope
+    bend = peak * (20 * square * contact.k5 - 6 * contact.k3)
+    by_peak = by_force * tangent + with_peak * h * secant + by_slope * bend
+    # The same for each factor of a tangent: one barrier for each, so that what a derivative does not need is left out.
+    factors = by_force * peak, by_slope, by_peak, h * with_c, fall * force * per_span
+    by_force, by_slope, by_peak, by_c, by_drop = map(jax.lax.optimization_barrier, factors)
+    total = (by_force + by_slope) * change.k1 - square * ((by_force + 3 * by_slope) * change.k3)
+    total = total + square * square * ((by_force + 5 * by_slope) * change.k5) + by_peak * dpeak
+    total = total + by_c * change.c - by_drop * ddrop
+    # Transposed, this is a barrier for the cotangent, which otherwise would be computed again for each input.
+    return force * ratio, jax.lax.optimization_barrier(total)
+
+
+def falling(s: Values) -> tuple[Values, Values]:
+    """The recovered share where force falls with it, else 0, and -f' there."""
+    inside = (s > 0) & (s < 1)
+    s = jnp.where(inside, s, 0.0)
+    return s, jnp.where(inside, 4 / jnp.pi * recompute(jnp.sqrt((1 - s) * (1 + s))), 0.0)
+
+
+def _branch(contact: Contact, peak: Values, drop: Values) -> tuple[Values, Recovered, Values, Values, Values]:
+    """Peak force, what it recovers, one over that, the share of it recovered so far, share of the force left."""
+    recovered = contact.recovered(peak)
+    per_span = recompute(recovered.bottom / recovered.top)
+    s = jnp.where(recovered.carries, drop * per_span, 1.0)
+    return contact.loading(peak), recovered, per_span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s))
+
+
+# ---- the four numbers from law and size ------------------------------------------------------------------------------
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def coefficients(
+    unloading: Unloading,
+    scaling: StrainScaling,
+    area: float,
+    K1: Scalar,
+    K3: Scalar,
+    K5: Scalar,
+    modulus: Scalar,
+    eta: Scalar,
+    length: Scalar,
+    inverse: Scalar,
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    r"""k1, k3, k5 and c of a contact with :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` at :math:`x = \eta_p \gamma / L`.
+
+    .. math:: k_m = A K_m (\eta_p / L)^m, \qquad c = L^3 / (k\, \eta_p^p\, (\bar E A)^n)
+
+    with k and n of the `Unloading` form and p of the `StrainScaling`. Derivatives are written out, because reverse mode
+    then takes half as many operations.
+
+    Args:
+        area: A / L^2, which turns K and the unit of length into the unit of force.
+        K1, K3, K5, modulus: factors of the quintic, and the effective modulus [MPa].
+        eta: shape factor [-].
+        length, inverse: L, effective diameter or radius, and one over it, for derivatives a function of the length.
+    """
+    first, third, fifth, _ = _powers(area, eta, length, inverse)
+    c = _compliance(unloading, scaling, area, unloading.stress_power, modulus, eta, length, inverse)
+    return K1 * first, K3 * third, K5 * fifth, c
+
+
+@coefficients.defjvp
+def _coefficients_jvp(unloading: Unloading, scaling: StrainScaling, area: float, primals: Any, tangents: Any) -> Any:
+    K1, K3, K5, *size = primals
+    dK1, dK3, dK5, dmodulus, deta, dlength, _ = tangents
+    _, eta, length, inverse = size
+    first, third, fifth, square = _powers(area, eta, length, inverse)
+    by_eta, by_length = area * length, area * eta
+    n, p = unloading.stress_power, scaling.power
+    c, per_modulus = (_compliance(unloading, scaling, area, k, *size) for k in (n, n + 1))
+    dc = (3 - 2 * n) * (c * inverse) * dlength - n * per_modulus * dmodulus
+    changes = (
+        first * dK1 + K1 * (by_eta * deta + by_length * dlength),
+        third * dK3 + K3 * square * (3 * by_eta * deta - by_length * dlength),
+        fifth * dK5 + K5 * (square * square) * (5 * by_eta * deta - 3 * by_length * dlength),
+        dc - p * recompute(c / eta) * deta if p else dc,
+    )
+    # Transposed, these are barriers for the cotangents, which otherwise would be computed again for each input. One for
+    # each: what does not depend on the input at hand has no transpose.
+    return (K1 * first, K3 * third, K5 * fifth, c), tuple(map(jax.lax.optimization_barrier, changes))
+
+
+def _powers(area: float, eta: Scalar, length: Scalar, inverse: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """k_m / K_m for m = 1, 3, 5, and the square of the scaled strain over the displacement."""
+    slope = eta * inverse
+    square = slope * slope
+    first = area * (eta * length)
+    third = first * square
+    return first, third, third * square, square
+
+
+def _compliance(
+    unloading: Unloading,
+    scaling: StrainScaling,
+    area: float,
+    power: int,
+    modulus: Scalar,
+    eta: Scalar,
+    length: Scalar,
+    inverse: Scalar,
+) -> Scalar:
+    """c, or c over the modulus with its power one higher: a quotient of its own, which reverse mode need not store."""
+    n, p = unloading.stress_power, scaling.power
+    rest = unloading.constant * area**n * eta**p
+    return recompute((length if n == 1 else inverse) / (rest * modulus**power))

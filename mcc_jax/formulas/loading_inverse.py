@@ -6,21 +6,17 @@ at its peak when it is lost. Around the bend b the quintic is *exactly*
 .. math:: \sigma(b + d) = \sigma_b + m d + 2 K_3 d^3 + 5 K_5 b\, d^4 + K_5 d^5,
 
 so the root of its cubic part is such a start, and an upper bound to the right of the bend. Around a peak p the curve
-falls by :math:`H_0 e^2 + H_1 e^3 + \dots` with :math:`e = p - x`, again a cubic. From these starts four steps of
-Halley's method (Newton's, with the curvature) reach the last digit in every case tried: K3 = 0, the exact loss of
-monotonicity, peaks approached to 1e-14, stresses over 13 decades. The error is then the rounding of the curve itself.
+falls by :math:`H_0 e^2 + H_1 e^3 + \dots`, :math:`e = p - x`, again a cubic. From these starts four Halley steps reach
+the last digit in every case tried: K3 = 0, loss of monotonicity, peaks approached to 1e-14, stresses over 13 decades.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from .._numerics import rough_power, shared
-from .._types import Scalar, ScalarLike, Values
-from ..arguments import values
+from .._numerics import recompute, rough_power
+from .._types import Scalar, Values
 
 HALLEY_STEPS = 4
 
@@ -35,9 +31,8 @@ def secant_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     return jnp.where(value < 0, 0.0, value)  # this way round a parameter that is NaN shows
 
 
-def tangent_modulus(K1: ScalarLike, K3: ScalarLike, K5: ScalarLike, x: Any) -> Values:
+def tangent_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     """Slope of the quintic [MPa]."""
-    K1, K3, K5, x = (values(one, name) for one, name in ((K1, "K1"), (K3, "K3"), (K5, "K5"), (x, "x")))
     square = x * x
     return K1 - square * (3 * K3 - 5 * square * K5)
 
@@ -45,7 +40,7 @@ def tangent_modulus(K1: ScalarLike, K3: ScalarLike, K5: ScalarLike, x: Any) -> V
 def loading_work(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     """Integral of x times `secant_modulus`: the work of loading, none where the quintic would be tensile.
 
-    Derivatives are exact: at the ends of that stretch, which are roots of the quintic, they do not depend on the ends.
+    The ends of that stretch are roots of the quintic, so that derivatives do not depend on them.
     """
 
     def integral(square: Values) -> Values:
@@ -68,29 +63,18 @@ def quintic(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> tuple[Values, Valu
     return value, K1 - square * (3 * K3 - 5 * hardening), x * (10 * hardening - 3 * K3)
 
 
-def loading_strain(K1: ScalarLike, K3: ScalarLike, K5: ScalarLike, stress: Any, floor: ScalarLike) -> Values:
+@jax.custom_jvp
+def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Scalar) -> Values:
     """Smallest scaled strain, not on a branch already left behind, at which loading reaches the stress.
 
     Args:
-        K1: factor of x [MPa], > 0.
-        K3: factor of -x^3 [MPa], >= 0.
-        K5: factor of x^5 [MPa], > 0.
+        K1, K3, K5: factors of x, -x^3 and x^5 [MPa].
         stress: stress [MPa]; 0 is returned for stress <= 0.
-        floor: scaled strain that the particle has already seen. It matters only where the curve is not monotone:
-            behind the peak there is no way back to the first branch.
+        floor: scaled strain already seen; behind the peak of a curve that is not monotone there is no way back.
 
     Returns:
-        Scaled strain [-]. Derivatives follow from the implicit-function rule, 0 out of contact.
+        Scaled strain [-]; derivatives by the implicit-function rule, 0 out of contact.
     """
-    given = (values(x, name) for x, name in zip((K1, K3, K5, stress, floor), _NAMES, strict=True))
-    return _loading_strain(*given)
-
-
-_NAMES = ("K1", "K3", "K5", "stress", "floor")
-
-
-@jax.custom_jvp
-def _loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Scalar) -> Values:
     target = jnp.maximum(stress, 0.0)
     # The barrier makes two loops over the data, which on a CPU take four fifths of the time of a single one.
     x = jax.lax.optimization_barrier(_start(K1, K3, K5, target, floor))
@@ -104,11 +88,11 @@ def _loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: S
         squared = slope * slope
         divisor = jnp.maximum(squared - excess * half_curvature, 0.5 * squared)
         moves = (slope > noise) & (jnp.abs(excess) > rounding)
-        x = x - shared(excess * slope / jnp.where(moves, divisor, jnp.inf))
+        x = x - recompute(excess * slope / jnp.where(moves, divisor, jnp.inf))
     return x
 
 
-@_loading_strain.defjvp
+@loading_strain.defjvp
 def _loading_strain_jvp(primals, tangents):
     K1, K3, K5, stress, _ = primals
     dK1, dK3, dK5, dstress, _ = tangents
@@ -118,12 +102,12 @@ def _loading_strain_jvp(primals, tangents):
     # At the peak of a curve that is not monotone the derivative is infinite; a floor keeps it finite.
     smallest = jnp.sqrt(jnp.finfo(x.dtype).eps) * K1
     change = dstress - x * dK1 + cube * dK3 - x * x * cube * dK5
-    return x, jnp.where(stress >= 0, shared(change / jnp.where(slope > smallest, slope, smallest)), 0.0)
+    return x, jnp.where(stress >= 0, recompute(change / jnp.where(slope > smallest, slope, smallest)), 0.0)
 
 
 def _root(x: Values) -> Values:
     """Square root of the positive part, for code that is never differentiated."""
-    return shared(jnp.sqrt(jnp.maximum(x, 0.0)))
+    return recompute(jnp.sqrt(jnp.maximum(x, 0.0)))
 
 
 def _rough(x: Values, p: float) -> Values:
@@ -137,22 +121,22 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     discriminant = 9 * K3 * K3 - 20 * K1 * K5
     falls = discriminant > 0
     # Square of the scaled strain at the peak, the smaller root of the slope, without cancellation and division by K5.
-    y = shared(2 * K1 / (3 * K3 + _root(discriminant) + tiny))
+    y = recompute(2 * K1 / (3 * K3 + _root(discriminant) + tiny))
     peak = _root(y)
     drop = peak * (K1 - y * (K3 - y * K5)) - target
     first_branch = falls & (drop >= 0) & (floor <= peak)
 
     # Below a peak, H0 e^2 + H1 e^3 = drop: e = E g(H1 E / H0) with E = sqrt(drop / H0) and g(z) = (1 + 3z/2)^(-1/3),
     # right at both ends and 13 % off at worst between them.
-    over_H0 = shared(1 / jnp.maximum(peak * (3 * K3 - 10 * K5 * y), tiny))
+    over_H0 = recompute(1 / jnp.maximum(peak * (3 * K3 - 10 * K5 * y), tiny))
     E = _root(drop * over_H0)
     widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E * over_H0
 
     # Around the bend, d^3 + 3 p d = 2 q. With K3 -> 0 there is no bend; the cubic then stands in for K5 x^5.
-    over_K5 = shared(1 / jnp.maximum(K5, tiny))
+    over_K5 = recompute(1 / jnp.maximum(K5, tiny))
     bend_squared = 0.3 * K3 * over_K5
     bend = _root(bend_squared)
-    factor = shared(1 / jnp.maximum(2 * K3, _rough(K1 * K5, 0.5)))
+    factor = recompute(1 / jnp.maximum(2 * K3, _rough(K1 * K5, 0.5)))
     p = (K1 - 1.5 * bend_squared * K3) * factor * (1 / 3)
     secant = K1 - 0.7 * bend_squared * K3
     q = (target - bend * secant) * factor * 0.5
@@ -161,7 +145,7 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     # One cube root for both; that of a start need not be exact.
     root_cubed = jnp.where(first_branch, widening, half + _root(half * half + p * p * p))
     root = jnp.maximum(_rough(root_cubed, 1 / 3), jnp.where(first_branch, 1.0, _root(-p)))
-    over_root = shared(1 / root)
+    over_root = recompute(1 / root)
     around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p * over_root)
 
     # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. Where K1 x is

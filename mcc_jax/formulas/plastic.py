@@ -34,11 +34,10 @@ class Plastic(eqx.Module):
         C5: coefficient of the hardening term [-], > 0.
 
     Raises:
-        InputError: for a plain number out of its range. Computed ones pass: `MccLaw.is_valid` looks at them.
+        InputError: for a plain number out of its range; computed ones are judged by `MccLaw.is_valid`.
 
     References:
-        Bommireddy et al. (2018), eq. 16. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula
-        makes them pure numbers.
+        Bommireddy et al. (2018), eq. 16, where they are C1, C2, C3 in MPa, MPa^-3, MPa^-5.
     """
 
     C1: Scalar = eqx.field(converter=_coefficient)
@@ -65,9 +64,8 @@ class Plastic(eqx.Module):
     def is_monotone(self) -> Flag:
         r"""Whether stress never falls while strain grows: :math:`9 C_3^6 \le 20 C_1 C_5^5`.
 
-        With equality the curve has one point of zero slope. Beyond it the curve has a peak and a trough: under load
-        control the particle snaps through from the peak to the rising branch behind the trough, and force as a
-        function of displacement has no derivative with respect to load at the peak.
+        Beyond equality the curve has a peak and a trough: under load control the particle snaps through to the rising
+        branch, and force as a function of displacement has no derivative with respect to load at the peak.
         """
         K1, K3, K5 = self.polynomial
         return 9 * K3 * K3 <= 20 * K1 * K5
@@ -89,14 +87,10 @@ class Plastic(eqx.Module):
     def strain(self, stress: Float[Array, ...]) -> Float[Array, ...]:
         """Scaled strain at which the stress [MPa] is first reached from the virgin state; 0 for stress <= 0.
 
-        For a law that is not monotone this is the running maximum turned round: it jumps over peak and trough.
-        Differentiable in stress and coefficients by the implicit-function rule.
+        Of a law that is not monotone it jumps over peak and trough. Derivatives by the implicit-function rule.
         """
         return loading_strain(*self.polynomial, stress, jnp.zeros_like(self.C1))
 
     def work(self, x: Scalar) -> Scalar:
-        r"""Integral of `stress` over scaled strain, :math:`C_1 x^2/2 - C_3^3 x^4/4 + C_5^5 x^6/6` [MPa].
-
-        Without the stretch in which the quintic is negative, where there is one.
-        """
+        """Integral of `stress` over scaled strain [MPa], without the stretch in which the quintic is negative."""
         return loading_work(*self.polynomial, x)

@@ -1,13 +1,12 @@
 r"""The elastic branch in one variable: how stress falls as strain is recovered, its inverse and its energy.
 
-With :math:`s = (\epsilon_P - \epsilon)/\delta = \sqrt{1 - \phi^2}`, which is linear in strain, the arcsine law of
-unloading reads
+With :math:`s = (\epsilon_P - \epsilon)/\delta = \sqrt{1 - \phi^2}`, linear in strain, the arcsine law of unloading is
 
 .. math:: \sigma / \sigma_P = f(s) = \tfrac{2}{\pi}\left[\arccos s - s\sqrt{1 - s^2}\right].
 
-The printed form in :math:`\phi` loses all digits near both ends and has no derivative at the onset; here every function
-is an exact power of the distance to the singular end times a polynomial (square roots and multiply-adds, no arc
-function, no iteration). Accuracy: 4e-16 of the peak in float64, 2e-7 in float32.
+The printed form in :math:`\phi` loses all digits near both ends and has no derivative at the onset. Here every function
+is an exact power of the distance to the singular end times a polynomial. Accuracy: 4e-16 of the peak in float64, 2e-7
+in float32.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._numerics import horner, shared, two_thirds_power
+from .._numerics import horner, recompute, two_thirds_power
 from .._types import Values
 from ..arguments import values
 from .recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
@@ -28,14 +27,10 @@ def _is_double(x: Values) -> bool:
 
 
 def stress_ratio(s: Any) -> Values:
-    r"""Stress over peak stress on the elastic branch.
+    r"""Stress over peak stress :math:`f(s)` [-] after a share s of the strain is recovered: 1 for s <= 0, 0 for s >= 1.
 
-    Args:
-        s: strain recovered so far over the strain recovered on full release [-].
-
-    Returns:
-        :math:`f(s)` [-]: 1 for s <= 0, 0 for s >= 1, relative accuracy kept towards s = 1. The derivative is the closed
-        form :math:`-\tfrac{4}{\pi}\sqrt{1 - s^2}` on 0 <= s < 1 and 0 outside.
+    Relative accuracy is kept towards s = 1. The derivative is :math:`-\tfrac{4}{\pi}\sqrt{1 - s^2}` on 0 <= s < 1, else
+    0.
 
     References:
         Bommireddy et al. (2018), eq. 23, with phi^2 = 1 - s^2.
@@ -46,7 +41,7 @@ def stress_ratio(s: Any) -> Values:
 @jax.custom_jvp
 def _stress_ratio(s: Values) -> Values:
     u = jnp.clip(1 - s, 0, 1)
-    return u * shared(jnp.sqrt(u)) * horner(RATIO_64 if _is_double(u) else RATIO_32, 2 * u - 1)
+    return u * recompute(jnp.sqrt(u)) * horner(RATIO_64 if _is_double(u) else RATIO_32, 2 * u - 1)
 
 
 @_stress_ratio.defjvp
@@ -54,21 +49,15 @@ def _stress_ratio_jvp(primals, tangents):
     (s,), (ds,) = primals, tangents
     inside = (s >= 0) & (s < 1)
     chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
-    return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * shared(jnp.sqrt(chord)), 0.0) * ds
+    return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * recompute(jnp.sqrt(chord)), 0.0) * ds
 
 
 def recovery(ratio: Any) -> Values:
-    r"""Inverse of `stress_ratio`: the recovered share of strain at a share of the peak stress.
+    r"""Inverse of `stress_ratio`: the recovered share of strain [-] at a share of the peak stress.
 
     Solves Kepler's equation of eccentricity 1, :math:`E - \sin E = \pi\,\sigma/\sigma_P` with :math:`s = \cos(E/2)`, in
-    closed form.
-
-    Args:
-        ratio: stress over peak stress [-].
-
-    Returns:
-        s [-], 1 for ratio <= 0 and 0 for ratio >= 1. Its derivative grows as ratio^(-1/3) towards full release and is 0
-        beyond it, where the platen no longer touches.
+    closed form: 1 for ratio <= 0, 0 for ratio >= 1. The derivative grows as ratio^(-1/3) towards full release and is 0
+    beyond it, where the platen no longer touches.
     """
     return _recovery(values(ratio, "ratio"))
 
@@ -78,7 +67,7 @@ def recovery(ratio: Any) -> Values:
 def _recovery(ratio: Values) -> Values:
     r = jnp.clip(ratio, 0, 1)
     w = two_thirds_power(r)
-    rest = shared((1 - r) * (1 + r) / (1 + w * (1 + w)))  # 1 - w, all digits kept towards the peak
+    rest = recompute((1 - r) * (1 + r) / (1 + w * (1 + w)))  # 1 - w, all digits kept towards the peak
     return jnp.clip(rest * horner(RECOVERY_64 if _is_double(w) else RECOVERY_32, 2 * w - 1), 0, 1)
 
 
@@ -88,19 +77,13 @@ def _recovery_jvp(primals, tangents):
     s = recovery(ratio)
     inside = (ratio > 0) & (ratio <= 1) & (s < 1)
     chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
-    return s, jnp.where(inside, shared(-jnp.pi / 4 / jnp.sqrt(chord)), 0.0) * dratio
+    return s, jnp.where(inside, recompute(-jnp.pi / 4 / jnp.sqrt(chord)), 0.0) * dratio
 
 
 def energy_ratio(s: Any) -> Values:
-    r"""Elastic energy still stored, over :math:`\sigma_P \delta`.
+    r"""Elastic energy [-] still stored at a recovered share s, over :math:`\sigma_P \delta`: 4/(3 pi) at the onset.
 
     .. math:: g(s) = \int_s^1 f = \tfrac{2}{\pi}\left[\sqrt{1 - s^2} - s\arccos s - \tfrac13 (1 - s^2)^{3/2}\right]
-
-    Args:
-        s: recovered share of strain [-].
-
-    Returns:
-        g [-], 4/(3 pi) at the onset of unloading, 0 on full release.
     """
     return _energy_ratio(values(s, "s"))
 

@@ -12,22 +12,19 @@ PUNCH_AREA = 1.43
 class Unloading(enum.Enum):
     r"""Form of the strain :math:`\delta` recovered on full release.
 
-    - `PRINTED`, what the paper prints and so the default: :math:`\delta^2 = \sigma_P / (4.12\,\bar E\,\epsilon_P)`,
-      first power of :math:`\bar E/\sigma_P`. The paper's :math:`\bar E` = 16 GPa belongs to this form **only**. It is
-      not what the rigid-punch derivation gives: recovery goes as the root of stress over modulus instead of their
-      ratio.
-    - `PUNCH`, the rigid-punch decomposition with the paper's constant: :math:`\delta = \sigma_P / (\bar E
-      \sqrt{k\,\epsilon_P})`, :math:`k = 256 c^2/(9\pi^2)` = 4.1213. This is where 4.12 comes from, and it belongs to
-      :math:`(\bar E/\sigma_P)^2`.
-    - `PUNCH_EXACT`, the same with the constant that perfect plasticity needs, :math:`k = 4 c^2` = 5.72; unloading then
-      starts with the exact stiffness of a flat punch, :math:`dF/d\gamma = 2 \bar E a_P`.
+    - `PRINTED`, the default: :math:`\delta^2 = \sigma_P / (4.12\,\bar E\,\epsilon_P)`, first power of
+      :math:`\bar E/\sigma_P`. The paper's :math:`\bar E` = 16 GPa belongs to this form **only**. The rigid-punch
+      derivation gives the second power.
+    - `PUNCH`, that derivation with the paper's constant: :math:`\delta = \sigma_P / (\bar E \sqrt{k\,\epsilon_P})`,
+      :math:`k = 256 c^2/(9\pi^2)` = 4.1213, where 4.12 comes from.
+    - `PUNCH_EXACT`, with the constant of perfect plasticity, :math:`k = 4 c^2` = 5.72: unloading starts with the exact
+      stiffness of a flat punch, :math:`dF/d\gamma = 2 \bar E a_P`.
 
-    With 16 GPa in a punch form, unloading is a vertical line (recovered strain about 5e-4); a punch form describes the
-    same curves as the printed one with a modulus of 0.3 to 0.6 GPa. Independent finite elements favour the punch forms.
+    With 16 GPa in a punch form unloading is a vertical line (recovered strain about 5e-4); a punch form describes the
+    same curves with 0.3 to 0.6 GPa. Independent finite elements favour the punch forms.
 
-    No form gives back more energy than it took (`recovery_limit`). With the paper's numbers that matters below a peak
-    strain of 0.010 to 0.014 in the printed form (0.07 to 0.18 MPa) and below 2e-7 in the punch forms; above, every form
-    is its formula throughout the tested range.
+    With the paper's numbers the limit of recovery (`formulas.contact`) matters below a peak strain of 0.010 to 0.014 in
+    the printed form (0.07 to 0.18 MPa) and below 2e-7 in the punch forms; above, every form is its formula.
 
     References:
         Bommireddy et al. (2018), eq. 24; Mesarovic and Johnson (2000); Hill and Storakers (1990).
@@ -58,11 +55,10 @@ class StrainScaling(enum.Enum):
 
     .. math:: 1 - \phi^2 = k\, (\bar E/\sigma_P)^n\, \eta_p^p\, \epsilon_P\, (\epsilon_P - \epsilon)^2
 
-    - `RAW`, p = 0: the paper to the letter, which prints bare strains in phi.
-    - `CONTACT`, p = 1: the contact area at the peak grows as :math:`\eta_p \epsilon_P` while the elastic approach is
-      the real displacement; the physics of a punch on a shaped particle.
-    - `MASTER`, p = 3: every strain scaled; the only one for which unloading obeys the paper's own
-      :math:`\sigma_i(\epsilon) = \sigma(\eta_p \epsilon)`, so that all particles collapse on one curve.
+    - `RAW`, p = 0: the paper to the letter, bare strains in phi.
+    - `CONTACT`, p = 1: contact area grows as :math:`\eta_p \epsilon_P`, elastic approach is the real displacement.
+    - `MASTER`, p = 3: every strain scaled, :math:`\sigma_i(\epsilon) = \sigma(\eta_p \epsilon)`: all particles collapse
+      on one curve.
     """
 
     RAW = "raw"

@@ -1,13 +1,10 @@
-"""The contact law: loading, unloading, reloading, its inverse, its energy, its population, its references."""
+"""The contact law: loading, unloading, reloading, its inverse, its energy, its population."""
 
 from ..formulas import Formulas as Formulas
-from ..formulas.loading_inverse import loading_strain as loading_strain
-from ..formulas.loading_inverse import tangent_modulus as tangent_modulus
 from ..formulas.plastic import Plastic as Plastic
 from ..formulas.recovery import energy_ratio as energy_ratio
 from ..formulas.recovery import recovery as recovery
 from ..formulas.recovery import stress_ratio as stress_ratio
-from ..formulas.recovery_limit import recovery_limit as recovery_limit
 from ..formulas.unloading import PUNCH_AREA as PUNCH_AREA
 from ..formulas.unloading import StrainScaling as StrainScaling
 from ..formulas.unloading import Unloading as Unloading
@@ -19,8 +16,3 @@ from .mcc import History as History
 from .mcc import MccLaw as MccLaw
 from .population import LogNormal as LogNormal
 from .population import PlasticPopulation as PlasticPopulation
-from .reference import hertz_shape_factor as hertz_shape_factor
-from .reference import hertz_stress as hertz_stress
-from .reference import ideal_plastic_stress as ideal_plastic_stress
-from .reference import similarity_strength as similarity_strength
-from .reference import similarity_stress as similarity_stress

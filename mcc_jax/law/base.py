@@ -1,4 +1,4 @@
-"""What every contact law is: a state, one step of it, and the same along a path."""
+"""Interface of a contact law: a state, one step of it, and the same along a path."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from ..geometry import Particle
 class AbstractContactLaw[State](eqx.Module):
     """One particle between two platens: `init` gives the virgin state, `step` advances it.
 
-    There is no batch axis; batch laws and particles with `equinox.filter_vmap`. Parameters are the law's own fields,
-    size and shape come as a `Particle`, and history is what `step` returns. No method checks values: entry points such
-    as `simulate.drive` do.
+    There is no batch axis: batch laws and particles with `equinox.filter_vmap`. No method checks values: entry points
+    such as `simulate.drive` do.
     """
 
     @property

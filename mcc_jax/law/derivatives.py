@@ -29,7 +29,7 @@ from ..formulas import Formulas, Plastic, StrainScaling, Unloading
 from ..geometry import Particle
 from .loading import NEWTON_STEPS, base_strain, newton_step, slope_at, stress_at
 from .mcc import MccLaw
-from .response import additions, no_memory, peak_displacement, peak_forces, released, since_peak
+from .response import additions, hold_virgin, initial_memory, peak_displacement, peak_forces, released
 
 DIRECTIONS = 12
 """As many as two effects with two further numbers each need; with fewer the rest is padding, so that all formulas share
@@ -172,7 +172,7 @@ def _loaded(
 def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
     numbers, loads = given
     _, law, record, highest = _loaded(numbers, loads, particle, record, forms)
-    reached, moved = law.peak_and_displacement(particle, jnp.zeros_like(particle.D3), record.force, highest)
+    reached, moved = law.contact(particle).under(jnp.zeros_like(particle.D3), record.force, highest)
     return reached, law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached)), moved
 
 
@@ -198,7 +198,7 @@ def _hook(given: Any, particle: Particle, record: Record, static: Any, effect: A
     context = Context(*loaded, *moved)
     if which == "stiffness":
         return effect.stiffness(context)
-    before = no_memory((effect,), jnp.zeros_like(particle.D3))
+    before = initial_memory((effect,), jnp.zeros_like(particle.D3))
     return additions((effect,), eqx.tree_at(lambda m: m.point.time, before, record.time[0]), context)[-1]
 
 
@@ -249,7 +249,7 @@ def _reached(
     def peak(given: Any, particle: Particle, record: Record, _: Any) -> Array:
         strain, *loads = given
         _, _, record, highest = _loaded(law[0], loads, particle, record, forms)
-        return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), since_peak(record))
+        return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), hold_virgin(record))
 
     off, change = _staged(residual, (law, loads, factors), (*directions, slopes), (particle, strain), None)
     by_strain = jax.tree.map(lambda x: x[-1], slopes)
@@ -297,7 +297,7 @@ def signatures(
             own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
             law = eqx.filter(own.modify(formulas, particle, record), eqx.is_inexact_array) if inside else None
             factors = own.loading(formulas, particle, record, strain) if loads else None
-            start = eqx.tree_at(lambda m: m.point.time, no_memory((own,), zero_um), record.time[0])
+            start = eqx.tree_at(lambda m: m.point.time, initial_memory((own,), zero_um), record.time[0])
             return law, factors, own.stiffness(context) if inside else None, additions((own,), start, context)[-1]
 
         zero = jnp.zeros_like(effect.amplitude)
@@ -340,5 +340,5 @@ def _response(law: Formulas, context: Context, shift: Path, stiffness: Path) -> 
     """Displacement of a virgin particle whose loading strain is shifted and whose modulus has a factor."""
     particle, record, highest = context.particle, context.record, context.peak_force
     strain = _virgin_strain(law, context) + shift
-    peak = peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), since_peak(record))
+    peak = peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), hold_virgin(record))
     return released(Context(particle, law, record, highest, *(peak,) * 3), [stiffness]).displacement

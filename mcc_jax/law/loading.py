@@ -18,18 +18,11 @@ NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effec
 
 
 def strain_under(effects: Effects, law: Formulas, particle: Particle, record: Record, stress: Values) -> Values:
-    r"""Strain of virgin loading at a stress when effects change the loading curve.
+    r"""Strain of virgin loading at a stress [MPa] when effects change the loading curve; 0 at and below zero.
 
     Solves :math:`f_1 K_1 x - f_3 K_3 x^3 + f_5 K_5 x^5 = \sigma`, :math:`x = \eta_p \epsilon`, with factors
     :math:`f_j(\epsilon)`: the base law's inverse with the factors at its own strain, then Newton's method. Derivatives
     follow from the implicit-function rule, as one Newton step from the frozen root is differentiated.
-
-    Args:
-        effects: those whose `loading` acts.
-        law: the law.
-        particle: the particle.
-        record: the points; its rates may enter.
-        stress: stress [MPa]; 0 is returned at and below zero.
     """
     target = jnp.where(stress >= 0, stress, 0.0)
     fixed = jax.tree.map(jax.lax.stop_gradient, (effects, law, particle, record))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,7 +17,7 @@ from .._numerics import compiled_whole, running_max
 from .._types import Flag, Path, Scalar, scalar
 from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record, Variant, clean_record, find_variant
 from ..effects.record import first_point
-from ..formulas import Formulas
+from ..formulas import Contact, Formulas
 from ..geometry import Particle
 from .base import AbstractContactLaw
 from .passivity import first_gain
@@ -24,11 +25,11 @@ from .response import (
     factor_at_peak,
     folded,
     force_at,
+    hold_virgin,
+    initial_memory,
     modified,
-    no_memory,
     one_point,
     peak_forces,
-    since_peak,
     whole_path,
 )
 
@@ -37,14 +38,12 @@ TESTED_STRAIN = 0.67
 
 
 class History(eqx.Module):
-    r"""What a particle remembers: the largest platen displacement, and with effects what they remember.
-
-    The paper's two internal variables :math:`\epsilon_P, \sigma_P` are functions of it (`MccLaw.internal_variables`).
+    """What a particle remembers: the largest platen displacement, and with effects what they remember.
 
     Attributes:
-        displacement_max: largest displacement so far [um]; 0 for a virgin particle, never decreases. With effects that
-            of the law itself, without what they add.
-        memory: what effects and tester remember (`Memory`); None for a law without effects.
+        displacement_max: largest displacement so far [um]; 0 for a virgin particle. With effects that of the law
+            itself, without what they add.
+        memory: what effects and instrument remember (`Memory`); None for a law without effects.
     """
 
     displacement_max: Scalar = eqx.field(converter=scalar)
@@ -59,7 +58,7 @@ class Energy(eqx.Module):
     Attributes:
         work: work done by the platens up to now.
         recoverable: what the particle would still give back on full release.
-        dissipated: what is lost for good; it does not change while unloading and reloading.
+        dissipated: what is lost for good; unchanged by unloading and reloading.
     """
 
     work: Scalar
@@ -99,24 +98,21 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         \sigma &= \tfrac{2}{\pi} \sigma_P \left[\arccos s - s\sqrt{1 - s^2}\right],\quad
             s = (\epsilon_P - \epsilon)/\delta && \text{elastic unloading and reloading}
 
-    and zero once s >= 1. The recovered strain :math:`\delta` has three forms (`Unloading`) and three ways in which
-    :math:`\eta_p` enters (`StrainScaling`); the defaults are the paper's. Reloading retraces unloading and rejoins the
-    loading curve at :math:`\epsilon_P`. Rate independent, no adhesion.
+    and zero once s >= 1 (`formulas.Contact`). The recovered strain :math:`\delta` has three forms (`Unloading`) and
+    three ways in which :math:`\eta_p` enters (`StrainScaling`); the defaults are the paper's. Rate independent, no
+    adhesion.
 
-    `effects` act on it together; the base law is the law without any. Under load control, the primary form,
+    `effects` act on it together. Under load control, the primary form,
 
     .. math:: \gamma(F, t) = \gamma_{law}(F;\, \text{modified parameters}) + \sum_k \Delta_k(F, t),
 
-    and displacement control solves it for the force. Amplitudes of zero change nothing. Where effects act, methods
-    that advance the law take times [s] as well; None stands for a test in which no time passes.
+    and displacement control solves it for the force. Amplitudes of zero change nothing. With effects, methods that
+    advance the law take times [s] as well; None stands for a test in which no time passes.
 
     Validity: the paper's tests ended at 7 to 16 MPa, :math:`\eta_p\epsilon \le 0.67` on the mean curve. If the quintic
-    is not monotone (`is_monotone`), displacement control follows it down, load control snaps through; nothing becomes
-    NaN.
-
-    At zero displacement, at the onset of unloading, on full release and out of contact, value and first derivatives are
-    finite in both modes. Where branches meet (a kink of the model itself) the derivative is that of loading at the
-    onset, and that of the released particle at full release.
+    is not monotone, displacement control follows it down, load control snaps through. Value and first derivatives are
+    finite everywhere, in both modes; at the onset of unloading the derivative is that of loading, at full release that
+    of the released particle.
 
     Attributes:
         plastic: C1, C3, C5.
@@ -124,7 +120,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         effective_modulus: :math:`\bar E = E/(1-\nu^2)` [MPa], > 0; its value belongs to the chosen `unloading` form.
         unloading: form of the recovered strain, also as its text: "printed", "punch", "punch_exact".
         strain_scaling: how the shape factor enters it, also as its text: "raw", "contact", "master".
-        effects: what acts besides the formulas above; their order does not matter beyond rounding.
+        effects: what acts in addition to the formulas above; their order does not matter beyond rounding.
 
     Raises:
         InputError: for a plain number out of its range, or an unknown form.
@@ -157,24 +153,17 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         """The law with further effects.
 
         Args:
-            effects: each by name, "mechanism" or "mechanism:variant", of `mcc_jax.effects.LIBRARY`, or a `Variant`:
-                both with the middle of its plausible range; or an effect built with an amplitude of one's own.
-
-        Raises:
-            InputError: for a name that does not exist, naming those that do.
+            effects: each by name, "mechanism" or "mechanism:variant" of `mcc_jax.effects.LIBRARY`, or a `Variant`, both
+                with the middle of its plausible range; or an effect built with an amplitude of one's own.
         """
         return self._with((*self.effects, *(_one_effect(effect) for effect in effects)))
 
     def of_particle(self) -> MccLaw:
-        """The law without what belongs to the tester (frame, drift, platens): what the particle does elsewhere."""
+        """The law without what belongs to the instrument (frame, drift, platens)."""
         return self._with(tuple(effect for effect in self.effects if not effect.of_tester))
 
     def without_effects(self, *names: str) -> MccLaw:
-        """The law without the effects of these names, as `effect.name` gives them; without names, without any.
-
-        Raises:
-            InputError: for a name that no effect has, naming those there are.
-        """
+        """The law without the effects of these names, as `effect.name` gives them; without names, without any."""
         for name in names:
             arguments.choice(name, [effect.name for effect in self.effects], "the name of an effect of the law")
         return self._with(tuple(e for e in self.effects if names and e.name not in names))
@@ -193,20 +182,15 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     @compiled_whole
     def residual_displacement(self, particle: Particle, history: History) -> Scalar:
         """Displacement [um] that stays after full release, by the formulas without effects."""
-        strain_max = particle.strain(history.displacement_max)
-        return history.displacement_max - particle.displacement(self.recoverable_strain(particle, strain_max))
+        peak = history.displacement_max
+        return peak - self.contact(particle).recovered(peak).displacement
 
     # ---- force and displacement --------------------------------------------------------------------------------------
 
     def init(self, particle: Particle, relative_humidity: Scalar | None = None) -> History:
-        """A virgin particle at the beginning of its test.
-
-        Args:
-            particle: the particle.
-            relative_humidity: of the room [%], for effects of humidity; the reference if None.
-        """
+        """A virgin particle at the beginning of its test; relative humidity [%] of the room, the reference if None."""
         zero = jnp.zeros_like(particle.D3)
-        return History(zero, no_memory(self.effects, zero, relative_humidity) if self.effects else None)
+        return History(zero, initial_memory(self.effects, zero, relative_humidity) if self.effects else None)
 
     @compiled_whole
     def step(
@@ -214,9 +198,9 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     ) -> tuple[History, Scalar]:
         """Force [mN] at the platen displacement [um] (negative: not yet touching) and time [s], and the history after.
 
-        With effects: the force that makes `step_load` meet the displacement; 0 where the platen does not touch.
-        Displacement must grow with force, as it does for all but absurd amplitudes. Where it jumps (a law that is not
-        monotone, a sharp pop-in), the force stays at that of the jump.
+        With effects: the force that makes `step_load` meet the displacement, which must grow with force; 0 where the
+        platen does not touch. Where it jumps (a law that is not monotone, a pop-in), the force stays at that of the
+        jump.
         """
         if self.effects:
             # What one MPa takes is a scale for a particle that was never loaded.
@@ -224,9 +208,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             arguments = (self, particle, state, time)
             force = force_at(_moved, arguments, displacement, scale)
             return self.step_load(particle, state, force, time)[0], force
-        # Asked this way round, a displacement that is NaN shows; so it is below.
-        peak = jnp.where(displacement < state.displacement_max, state.displacement_max, displacement)
-        return History(peak), self.force(particle, displacement, peak)
+        peak, force = self.contact(particle).step(state.displacement_max, displacement)
+        return History(peak), force
 
     @compiled_whole
     def step_load(
@@ -242,7 +225,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
                 self.formulas, self.effects, particle, state.displacement_max, state.memory, force, now
             )
             return History(peak, memory), displacement
-        peak, displacement = self.peak_and_displacement(particle, state.displacement_max, force, force)
+        peak, displacement = self.contact(particle).under(state.displacement_max, force, force)
         return History(peak), displacement
 
     @compiled_whole
@@ -255,9 +238,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         """
         if self.effects:
             return super().path(particle, state, displacement, time)
-        highest = running_max(displacement)
-        peak = jnp.where(highest < state.displacement_max, state.displacement_max, highest)
-        return History(peak[-1]), self.force(particle, displacement, peak)
+        peak, force = self.contact(particle).path(state.displacement_max, displacement)
+        return History(peak), force
 
     @compiled_whole
     def path_load(
@@ -265,8 +247,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     ) -> tuple[History, Path]:
         """Displacements [um] along a clean path of forces [mN] at times [s], in closed form over the running maximum.
 
-        A scan follows the effects' memories only. For measured forces, which are noisy, make a `Record` from their
-        segments and use `respond`.
+        A scan follows the effects' memories only. For measured, noisy forces make a `Record` and use `respond`.
         """
         if self.effects:
             before = state.memory.point
@@ -275,7 +256,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             peak_force = state.memory.peak_force
             record = clean_record(force, time, relative_humidity=humidity, before=before, peak_force=peak_force)
             return self._along(particle, state, record)
-        peak, displacement = self.peak_and_displacement(particle, state.displacement_max, force, running_max(force))
+        peak, displacement = self.contact(particle).under(state.displacement_max, force, running_max(force))
         return History(peak[-1]), displacement
 
     def respond(self, particle: Particle, record: Record) -> Path:
@@ -285,13 +266,13 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             state = eqx.tree_at(lambda s: s.memory.point.time, state, record.time[0])
             return self._along(particle, state, record)[1]
         zero = state.displacement_max
-        return self.peak_and_displacement(particle, zero, record.force, peak_forces(record, zero))[1]
+        return self.contact(particle).under(zero, record.force, peak_forces(record, zero))[1]
 
     def context(self, particle: Particle, record: Record) -> Context:
-        """What effects are told along a record, from a virgin particle: the law with modified parameters."""
+        """What effects see along a record, from a virgin particle: the law with modified parameters."""
         zero = jnp.zeros_like(particle.D3)
         return modified(
-            self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), since_peak(record)
+            self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), hold_virgin(record)
         )
 
     def _along(self, particle: Particle, state: History, record: Record) -> tuple[History, Path]:
@@ -306,10 +287,9 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def gain_strain(self, particle: Particle, state: History) -> Scalar:
         """Smallest peak strain [-] beyond which the particle, loaded further and released, gains energy.
 
-        Infinite where it does not up to the state's peak, and without damage and densification it never does
-        (`recovery_limit`). Damage that grows fast adds more recovery than further loading takes. Methods that advance
-        the law do not ask; `simulate.drive` does. Effects on parameters and on the modulus at the peak enter; others
-        (cyclic damage, rates, creep) have no energy in closed form and are left aside.
+        Infinite where it does not up to the state's peak, and without damage and densification it never does. Methods
+        that advance the law do not ask; `simulate.drive` does. Effects on parameters and on the modulus at the peak
+        enter; others (cyclic damage, rates, creep) have no energy in closed form and are left aside.
         """
         at_peak = tuple(e for e in self.effects if isinstance(e, AbstractModulusAtPeak))
         if not at_peak:
@@ -318,7 +298,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         formulas = self.formulas
         for effect in self.effects:
             formulas = effect.modify(formulas, particle, record)
-        return first_gain(formulas, at_peak, particle, state.displacement_max)
+        contact_at = functools.partial(_unloading_from, formulas, at_peak, particle)
+        return particle.strain(first_gain(contact_at, state.displacement_max))
 
     @compiled_whole
     def energy(self, particle: Particle, history: History, displacement: Scalar) -> Energy:
@@ -327,23 +308,26 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         .. math:: W_{rec} = \pi R_e^2 D_e\, \sigma_P\, \delta\, g(s), \quad g(0) = \tfrac{4}{3\pi}, \qquad
             W_{diss} = W_{load}(\epsilon_P) - W_{rec}(s = 0)
 
-        Effects on parameters and on the modulus at the peak enter; the others have no energy in closed form.
-
-        Args:
-            particle: the particle.
-            history: its largest displacement; a larger `displacement` counts as further loading.
-            displacement: where it is now [um].
+        A displacement beyond the peak counts as further loading. Effects on parameters and on the modulus at the peak
+        enter.
 
         Raises:
-            InputError: naming an effect whose energy is not known.
+            InputError: naming another effect, whose energy has no closed form.
         """
         peak = jnp.where(displacement >= history.displacement_max, displacement, history.displacement_max)
         formulas, at_peak = folded(self.formulas, self.effects, particle, "the energy")
-        strain = particle.strain(peak)
-        factor = factor_at_peak(at_peak, strain, formulas.loading_stress(particle, strain)) if at_peak else None
-        whole, now = formulas.recoverable_work(particle, peak, displacement, factor)
-        dissipated = formulas.loading_work(particle, peak) - whole
+        contact = _unloading_from(formulas, at_peak, particle, peak)
+        whole, now = contact.stored(peak, peak - displacement)
+        dissipated = contact.work(peak) - whole
         return Energy(dissipated + now, now, dissipated)
+
+
+def _unloading_from(
+    law: Formulas, at_peak: tuple[AbstractModulusAtPeak, ...], particle: Particle, peak: Scalar
+) -> Contact:
+    """The contact that unloads from a peak displacement [um], with the modulus that effects leave it there."""
+    contact, strain = law.contact(particle), particle.strain(peak)
+    return contact.softened(factor_at_peak(at_peak, strain, law.loading_stress(particle, strain)))
 
 
 def _moved(given: tuple[Any, Particle, History, Scalar | None], force: Scalar) -> Scalar:

@@ -59,13 +59,10 @@ class LogNormal(eqx.Module):
 
 
 class PlasticPopulation(eqx.Module):
-    r"""Log-normal, independent C1, C3, C5 of a batch of particles.
+    """Log-normal, independent C1, C3, C5 of a batch of particles (Bommireddy et al. 2018, Table 2 and eq. 17).
 
     Attributes:
         C1, C3, C5: their distributions.
-
-    References:
-        Bommireddy et al. (2018), Table 2 and eq. 17.
     """
 
     C1: LogNormal

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from .._errors import InputError
-from .._numerics import held, running_max
+from .._numerics import forward_fill, running_max
 from .._types import Path, Scalar, Values
 from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record
 from ..effects.record import first_point, follow
@@ -26,13 +26,12 @@ HALVINGS = 64  # from the width of the bracket to below the rounding of a double
 
 
 class Memory(eqx.Module):
-    """What effects and tester remember of a test.
+    """What effects and instrument remember of a test.
 
     Attributes:
         point: the latest point of the test.
         peak_force: largest force so far [mN].
-        of_effects: one entry per effect, None for those without a memory.
-        drivers: what drove each memory at the latest point.
+        of_effects, drivers: one entry per effect, None for those without a memory; what drove each at the latest point.
     """
 
     point: Record
@@ -41,7 +40,7 @@ class Memory(eqx.Module):
     drivers: tuple[Any, ...]
 
 
-def no_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | None = None) -> Memory:
+def initial_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | None = None) -> Memory:
     """The memory of a test that has not begun; `zero` gives the precision."""
     own = tuple(effect.start(zero) for effect in effects)
     drivers = tuple(None if memory is None else zero for memory in own)
@@ -49,19 +48,20 @@ def no_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | None =
 
 
 def peak_forces(record: Record, before: Scalar) -> Path:
-    """Force from which the branch of every point of a record starts [mN]: the largest so far, if the record knows no
-    better."""
+    """Force from which the branch of every point starts [mN]: the record's own peaks, else the largest so far."""
     highest = running_max(record.force) if record.peak is None else record.peak
     return jnp.where(highest > before, highest, before)
 
 
-def since_peak(record: Record) -> Callable[[Path], Path]:
-    """What carries the displacement of virgin loading along the branches that follow: the running maximum, or where the
-    record knows its peaks, the latest value on virgin loading."""
+def hold_virgin(record: Record) -> Callable[[Path], Path]:
+    """What carries the displacement of virgin loading along the branches that follow.
+
+    The running maximum, or where the record knows its peaks, the latest value on virgin loading.
+    """
     if record.peak is None:
         return running_max
     virgin = (record.force >= record.peak).at[0].set(True)
-    return lambda values: held(values, virgin)
+    return lambda values: forward_fill(values, virgin)
 
 
 def one_point(
@@ -94,7 +94,7 @@ def whole_path(
 ) -> tuple[Scalar, Memory, Path]:
     """The same after all points of a record, closed form but for the memories."""
     highest = peak_forces(record, memory.peak_force)
-    context = modified(law, effects, particle, displacement_max, record, highest, since_peak(record))
+    context = modified(law, effects, particle, displacement_max, record, highest, hold_virgin(record))
     own, drivers, added = additions(effects, memory, context)
     point, highest = jax.tree.map(lambda x: x[-1], (record.at_points, highest))
     after = Memory(point, highest, own, drivers)
@@ -110,13 +110,11 @@ def modified(
     highest: Values,
     along: Callable[[Values], Values],
 ) -> Context:
-    """The law with modified parameters, loading and modulus: what effects are told.
+    """The law with modified parameters, loading and modulus: what effects see.
 
     Args:
         law: the law without effects.
-        effects: what acts on it.
-        particle: the particle.
-        displacement_max: its largest displacement before [um].
+        displacement_max: the largest displacement before [um].
         record: one point or all of them.
         highest: the largest force so far [mN].
         along: the running maximum, or nothing for a single point.
@@ -129,7 +127,7 @@ def modified(
         strain = strain_under(loading, law, particle, record, particle.stress(record.force))
         reached = moved = peak_displacement(particle, record, highest, strain, displacement_max, along)
     else:
-        reached, moved = law.peak_and_displacement(particle, displacement_max, record.force, highest)
+        reached, moved = law.contact(particle).under(displacement_max, record.force, highest)
     recoverable = law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached))
     context = Context(particle, law, record, highest, reached, recoverable, moved)
     if loading or stiffening:
@@ -160,13 +158,7 @@ def released(context: Context, factors: Sequence[Values]) -> Context:
 
 
 def additions(effects: Effects, memory: Memory, context: Context) -> tuple[tuple[Any, ...], tuple[Any, ...], Path]:
-    """The effects' memories after a path under load control, what drove them last, and what is added along it [um].
-
-    Args:
-        effects: what acts.
-        memory: what they remember before the path.
-        context: the law along the path (`modified`).
-    """
+    """The effects' memories after a path under load control, what drove them last, and what is added along it [um]."""
     record = context.record
     seconds = jnp.diff(record.time, prepend=memory.point.time)
 
@@ -185,13 +177,7 @@ def force_at(
 ) -> Scalar:
     """Force [mN] at which a displacement [um] that grows with force is met; 0 where the platen does not touch.
 
-    Bisection in a bracket that grows as it has to. Derivatives follow from the implicit-function rule.
-
-    Args:
-        displacement_under: displacement [um] that what is given has under a force.
-        given: law, particle and state.
-        displacement: what is to be met.
-        scale: a force [mN] of the right size, > 0.
+    Bisection in a bracket that grows from a force of the right size; derivatives by the implicit-function rule.
     """
     still, target = jax.tree.map(jax.lax.stop_gradient, (given, displacement))
 
@@ -223,14 +209,9 @@ def folded(
 ) -> tuple[Formulas, tuple[AbstractModulusAtPeak, ...]]:
     """The law with the parameters that effects make of it for a particle, and the effects on the modulus at a peak.
 
-    Args:
-        law: the law without effects.
-        effects: what acts on it.
-        particle: the particle.
-        what: what is wanted of the law, for the message.
-
     Raises:
-        InputError: naming an effect that is not a closed formula of particle and peak.
+        InputError: naming an effect that is not a closed formula of particle and peak, and `what` was wanted of the
+            law.
     """
     at_peak = tuple(e for e in effects if isinstance(e, AbstractModulusAtPeak))
     for effect in effects:

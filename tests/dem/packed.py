@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -67,14 +68,5 @@ FORCES = jax.jit(contact_forces)
 
 def forces_of(pack, move, state, edges=None, time_step=None):
     """Forces of a state's contacts, on other edges or over another time step if given, and what they remember."""
-    return FORCES(
-        pack,
-        move.interaction,
-        state.walls,
-        state.position,
-        state.velocity,
-        state.spin,
-        state.edges if edges is None else edges,
-        state.wall_history,
-        move.time_step if time_step is None else time_step,
-    )
+    state = state if edges is None else eqx.tree_at(lambda s: s.edges, state, edges)
+    return FORCES(pack, move if time_step is None else eqx.tree_at(lambda m: m.time_step, move, time_step), state)

@@ -1,4 +1,4 @@
-"""Lists of contacts: history follows the pair through new lists, other orders, more room, other names, the disk."""
+"""Lists of contacts: history follows the pair through new lists, other orders, more room, the disk."""
 
 import os
 
@@ -20,9 +20,8 @@ from mcc_jax.dem import (
     carry_history,
     close_pairs,
     list_edges,
-    listed,
     load_state,
-    relabel,
+    rebuild_list,
     save_state,
 )
 
@@ -71,22 +70,6 @@ def test_history_follows_the_pair(old, new, seed):
     assert not second.overlap_max[~np.asarray(second.active)].any()
 
 
-@pytest.mark.extended
-@settings(max_examples=15, deadline=None)
-@given(pairs=pairs_strategy, seed=st.integers(0, 1000))
-def test_other_names_for_the_particles(pairs, seed):
-    """T5: a permutation and back is bitwise the same; slip is seen from the other side when a pair turns over."""
-    edges = with_history(list_edges(np.array(pairs, int).reshape(-1, 2), PARTICLES, 48))
-    label = np.random.default_rng(seed).permutation(PARTICLES)
-    turned = relabel(edges, jnp.asarray(label))
-    for (i, j), (overlap, slip) in remembered(edges).items():
-        a, b = int(label[i]), int(label[j])
-        sign = 1.0 if a < b else -1.0
-        assert remembered(turned)[min(a, b), max(a, b)] == (overlap, tuple(sign * s for s in slip))
-    back = relabel(turned, jnp.asarray(np.argsort(label)))
-    assert eqx.tree_equal(back, edges)
-
-
 def test_overflow_is_reported():
     edges = list_edges(np.array([[0, 1], [1, 2], [3, 2]]), 4, 2)
     assert bool(edges.overflow)
@@ -94,7 +77,7 @@ def test_overflow_is_reported():
     with pytest.raises(InputError, match="3 pairs do not fit into a list of 2 edges"):
         edges.require_room()
     with pytest.raises(InputError, match="do not fit"):
-        listed(packing(), dense(), SKIN, capacity=10)
+        rebuild_list(packing(), dense(), SKIN, capacity=10)
     list_edges(np.array([[0, 1]]), 4, 2).require_room()
 
 

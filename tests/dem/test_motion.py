@@ -20,8 +20,8 @@ from mcc_jax.dem import (
     close_pairs,
     die,
     list_edges,
-    listed,
     not_monotone,
+    rebuild_list,
     relative_density,
     replay,
     run,
@@ -195,7 +195,7 @@ def test_list_grows_when_full():
     """A list made for fewer pairs gets more room, by itself where none was asked for, and never loses a pair."""
     pairs = close_pairs(np.asarray(dense().position), np.asarray(packing().radius), SKIN)
     few = eqx.tree_at(lambda s: s.edges, dense(), list_edges(pairs[:10], len(dense().position), 10))
-    grown = listed(packing(), few, SKIN)
+    grown = rebuild_list(packing(), few, SKIN)
     assert grown.edges.capacity > len(pairs)
     assert int(grown.edges.wanted) == len(pairs)
     assert not bool(grown.edges.overflow)

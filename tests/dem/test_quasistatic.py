@@ -28,8 +28,8 @@ from mcc_jax.dem import (
     wall_force,
 )
 from mcc_jax.dem import quasistatic as quasistatic
-from mcc_jax.dem.load_steps import BOTTOM, TOP
-from mcc_jax.dem.stiffness import Held, balance, net_force
+from mcc_jax.dem.quasistatic import BOTTOM, TOP
+from mcc_jax.dem.stiffness import Problem, balance, net_force
 from mcc_jax.geometry import Particle
 
 LAW = paper_law()
@@ -88,7 +88,7 @@ def test_chain_between_punches_is_the_plate_test():
 def test_net_force_is_minus_the_gradient_of_the_energy_and_has_its_stiffness(pressed):
     packing, _, _, end, _, _ = pressed
     shift = 1e-3 * packing.radius[:, None] * jax.random.normal(jax.random.key(0), end.position.shape)
-    held = Held(packing, end.walls, end.edges, end.wall_history, end.position, jnp.asarray(3.0))
+    held = Problem(packing, end.walls, end.edges, end.wall_history, end.position, jnp.asarray(3.0))
     at, forces = jax.jit(balance), jax.jit(net_force)
     position, along = end.position + shift, 1e-5 * shift
     ahead, here, behind = (at(held, position + s * along) for s in (1, 0, -1))
@@ -127,14 +127,14 @@ def test_lists_do_not_change_the_compaction(pressed):
 @pytest.mark.extended
 def test_a_step_that_does_not_settle_is_halved_and_marked(pressed, monkeypatch):
     packing, state, heights, _, _, _ = pressed
-    settle = quasistatic._settle
+    settle = quasistatic._find_equilibrium
 
     def fails_in_the_lower_half(held, guess, rtol, max_steps):
         settled = settle(held, guess, rtol, max_steps)
         lower = held.walls[TOP].point[2] < 0.5 * (heights[0] + heights[1])
         return settled._replace(converged=settled.converged & ~lower)
 
-    monkeypatch.setattr(quasistatic, "_settle", fails_in_the_lower_half)
+    monkeypatch.setattr(quasistatic, "_find_equilibrium", fails_in_the_lower_half)
     tape = []
     _, rows = compact(packing, state, heights[:2], Solver(halvings=2), tape)
     assert rows.converged.tolist() == [True, False]

@@ -255,7 +255,7 @@ def test_bad_shapes_are_refused():
 
 
 def test_a_step_of_many_contacts_is_one_loop_for_each_result():
-    """Quotients and roots used in several places stay within the loop of their users (`_numerics.shared`)."""
+    """Quotients and roots used in several places stay within the loop of their users (`_numerics.recompute`)."""
     law, p = unpack(PAPER_THETA, Unloading.PRINTED, StrainScaling.RAW)
     arguments = jax.tree.map(lambda x: jnp.full(100_000, x), (law, p, History(jnp.asarray(20.0)), jnp.asarray(19.0)))
     text = jax.jit(jax.vmap(MccLaw.step)).lower(*arguments).compile().as_text()

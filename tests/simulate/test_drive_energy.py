@@ -57,12 +57,12 @@ def reach(law, particle):
 def load_at_the_end():
     """Force [mN] there."""
     end = jnp.asarray(reach(law_of(), PARTICLE))
-    return float(law_of().force(PARTICLE, end, end))
+    return float(law_of().contact(PARTICLE).loading(end))
 
 
 def forces(law, particle, peaks, depths):
     """Load to each peak [um] and unload by a share of its force, the last time wholly."""
-    carried = [float(law.force(particle, jnp.asarray(p), jnp.asarray(p))) for p in np.maximum.accumulate(peaks)]
+    carried = [float(law.contact(particle).loading(jnp.asarray(p))) for p in np.maximum.accumulate(peaks)]
     turns = [0.0]
     for force, depth in zip(carried, depths, strict=True):
         turns += [force, force * (1 - depth)]

@@ -1,0 +1,419 @@
+"""What a compaction curve says of the particles, and back: sensitivities, a band around it, parameters from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .. import arguments
+from .._errors import InputError
+from .._format import described
+from ..calibrate import Posterior
+from ..calibrate.population import Scatter, flattened, particles_at
+from ..law import MccLaw, Plastic
+from .packings import MCC_DENSITY, spheres
+from .quasistatic import TOP, Compaction, LoadStep, Replayed, Solver, compact, replay_stacked, stacked
+from .state import Packing, State, not_monotone
+
+PROBABILITY = (0.05, 0.5, 0.95)
+REDRAWS = 100  # of a particle's law, until it is monotone
+ROUNDS = 5  # compactions of a fit made again
+
+STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
+"""What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""
+
+Parameters = Float[Array | np.ndarray, " parameters"]
+PackingOf = Callable[[Float[Array, " parameters"]], Packing]
+
+
+class Sensitivity(NamedTuple):
+    r"""Force on the top punch and its derivatives, one row for each row of the compaction.
+
+    Attributes:
+        force: F on the top punch [N].
+        by_parameter: dF/dtheta, (rows, parameters) [N per unit of the parameter].
+        by_stress: p dF/dp for p in `STRESSES`, each scaled in all particles alike, (rows, 5) [N]. So dF/dln C1 is the
+            first column, dF/dln C3 three times the second, dF/dln C5 five times the third.
+        euler_defect: :math:`|\sum_p p\,\partial F/\partial p - F| / F`, zero in exact arithmetic: F is homogeneous of
+            degree one in all stresses (Euler's identity). In newtons where F = 0.
+        residual: largest net force over the mean contact force, the worst of the row's load steps.
+        proximal_share: the springs' axial forces, without sign, over F, the largest of the row's load steps.
+        converged: whether this row and all before it, whose history it carries, are in equilibrium.
+    """
+
+    force: np.ndarray
+    by_parameter: np.ndarray
+    by_stress: np.ndarray
+    euler_defect: np.ndarray
+    residual: np.ndarray
+    proximal_share: np.ndarray
+    converged: np.ndarray
+
+    __repr__ = described()
+
+
+def rescaled(packing: Packing, log_scale: Float[Array, " 4"]) -> Packing:
+    """The packing with K1 = C1, K3 = C3^3, K5 = C5^5 and Ebar of all particles times :math:`e^{s}`."""
+    sides = packing.sides
+    k1, k3, k5, modulus = (jnp.exp(s) for s in log_scale)
+    scaled = (sides.k1 * k1, sides.k3 * k3, sides.k5 * k5, sides.c / modulus**sides.power)
+    return eqx.tree_at(lambda p: (p.sides.k1, p.sides.k3, p.sides.k5, p.sides.c), packing, scaled)
+
+
+def punch_sensitivity(
+    packing_of: PackingOf, values: Parameters, state: State, tape: Sequence[LoadStep], solver: Solver | None = None
+) -> Sensitivity:
+    r"""Derivatives of the punch force with respect to any parameters of the packing, through all load steps.
+
+    .. math:: K_n\, dx_n = \partial_\theta f\, d\theta + \partial_{\delta_P} f\, d\delta_{P,n-1} + \mu\, dx_{n-1},
+
+    .. math:: d\delta_{P,n} = [\delta > \delta_P]\; d\delta(x_n) + [\delta \le \delta_P]\; d\delta_{P,n-1}
+
+    in forward mode: one factorisation of the stiffness K a load step. The derivative is that of the branch the
+    compaction took. Where contacts snap (`Compaction.largest_move`) a finite change of a parameter may move the snap to
+    another load step, which no derivative shows.
+
+    Args:
+        packing_of: the packing as a function of parameters; at `values` the one that made the tape.
+        values: parameters [any units].
+        state, tape, solver: start, load steps and solver of `compact`.
+    """
+    if not callable(packing_of):
+        raise InputError(f"packing_of must be a function of the values, got {arguments.kind_of(packing_of)}")
+    values = jnp.asarray(values, float)
+    last = np.array([step.last for step in tape])
+    # Outside the compiled function: that one then is the same for all parametrisations.
+    direction = jax.jacfwd(packing_of)(values)
+    packing = packing_of(values)
+    jacobian, (force, replayed) = _jacobian(packing, direction, state, stacked(tape), solver or Solver())
+    force, jacobian, worst = np.asarray(force), np.asarray(jacobian), np.asarray(replayed.residual)
+    row = np.concatenate([[0], np.cumsum(last)[:-1]])
+    by_stress = jacobian[last, len(values) :]
+    pressed = force > 0
+    share = np.where(pressed, np.asarray(replayed.proximal) / np.where(pressed, force, 1.0), np.inf)
+    reached = np.logical_and.accumulate(np.asarray(replayed.converged))
+    rows = range(int(last.sum()))
+    return Sensitivity(
+        force[last],
+        jacobian[last, : len(values)],
+        by_stress,
+        np.abs(by_stress.sum(axis=1) - force[last]) / np.where(pressed, force, 1.0)[last],
+        np.array([worst[row == r].max() for r in rows]),
+        np.array([share[row == r].max() for r in rows]),
+        reached[last],
+    )
+
+
+@eqx.filter_jit
+def _jacobian(
+    packing: Packing, direction: Packing, state: State, steps: LoadStep, solver: Solver
+) -> tuple[Array, tuple[Array, Replayed]]:
+    count = direction.radius.shape[-1]
+
+    def force(parameters: Array) -> tuple[Array, tuple[Array, Replayed]]:
+        along = jax.tree.map(lambda x, dx: x + dx @ parameters[:count], packing, direction)
+        springs = steps._replace(spring=steps.spring * jnp.exp(parameters[-1]))
+        replayed = replay_stacked(rescaled(along, parameters[count : count + 4]), state, springs, solver)
+        return replayed.on_wall[:, TOP], (replayed.on_wall[:, TOP], replayed)
+
+    return jax.jacfwd(force, has_aux=True)(jnp.zeros(count + len(STRESSES)))
+
+
+class PopulationPacking(NamedTuple):
+    """A packing as a function of what a calibration learnt of the population, and the posterior draws of that.
+
+    Attributes:
+        packing_of: the packing for one row of `draws`; differentiable.
+        draws, names: (draws, columns), and the names of the columns.
+    """
+
+    packing_of: PackingOf
+    draws: np.ndarray
+    names: tuple[str, ...]
+
+    __repr__ = described()
+
+
+class Band(NamedTuple):
+    """Quantiles of the force on the top punch, one column for each row of the compaction.
+
+    Attributes:
+        height, density: of the rows.
+        probability, quantiles: force on the top punch [N], (probabilities, rows).
+        standard_deviation: of that force [N]; infinite where a single draw converged.
+        used: draws that converged in a row; in the first-order band 1 where the one compaction did, else 0.
+        not_monotone: the most particles whose force falls on loading, over all draws used.
+        compaction, sensitivity: of the compaction at the mean of the draws (first order only).
+        forces: of every draw [N], NaN where it did not converge, (draws, rows) (by draws only).
+    """
+
+    height: np.ndarray
+    density: np.ndarray
+    probability: np.ndarray
+    quantiles: np.ndarray
+    standard_deviation: np.ndarray
+    used: np.ndarray
+    not_monotone: int
+    compaction: Compaction | None = None
+    sensitivity: Sensitivity | None = None
+    forces: np.ndarray | None = None
+
+    __repr__ = described()
+
+
+def population_packing(
+    calibration: Posterior, diameter: Any, *, seed: int = 0, density: float = MCC_DENSITY
+) -> PopulationPacking:
+    r"""Spheres whose laws follow the population, :math:`\ln C_i = \mu + \tau z_i`, and alike for the modulus.
+
+    The z of every particle are drawn once and kept, so that a draw of the population moves all particles together: the
+    band is about the population, not about which particles one happened to take. Particles not monotone at the
+    posterior mean are redrawn. Effects of the model act in the contacts, but for those of the instrument.
+
+    Args:
+        calibration: the posterior.
+        diameter: [um].
+        seed: of the z.
+        density: of a particle [kg/m^3].
+
+    Raises:
+        InputError: if the population hardly has a monotone law; for effects that contacts cannot have, by name.
+    """
+    diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
+    arguments.positive(diameter, "diameter [um]")
+    seed = arguments.seed(seed)
+    density = arguments.number(density, "density [kg/m^3]", above=0)
+    model = calibration.model
+    forms, varying = model.forms, model.scatter.varying
+    population = eqx.tree_at(lambda p: p.log_noise, flattened(calibration.population), None)
+    draws = np.asarray(jax.vmap(lambda one: ravel_pytree(one)[0])(population))
+    _, unravelled = ravel_pytree(jax.tree.map(lambda x: x[0], population))
+    names = ("a", "ln Ebar", "mu1", "mu3", "mu5", "tau1", "tau3", "tau5", "scatter of ln Ebar", "scatter of a")
+    names += (*forms.names, *(f"scatter of {name}" for name in model.varying_places))
+    size = jnp.asarray(diameter, float)
+    own = Scatter(modulus=True, shape=True, power=model.shape_power, varying=varying)
+
+    def laws(values: Array, z: Array) -> MccLaw:
+        shared = unravelled(values)
+        particles = particles_at(shared, jnp.zeros(len(z)), own, z)
+
+        def one(latent: Array, theta: Array) -> MccLaw:
+            C, modulus = jnp.exp(latent[:3]), jnp.exp(latent[3])
+            forms_of = model.unloading, model.strain_scaling, forms.build(theta)
+            return MccLaw(Plastic(C[0], C[1], C[2]), shared.a, modulus, *forms_of).of_particle()
+
+        return eqx.filter_vmap(one)(particles.latent, particles.theta)
+
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((len(size), own.size))
+    for _ in range(REDRAWS):
+        wrong = ~np.asarray(
+            eqx.filter_vmap(lambda law: law.is_monotone)(laws(jnp.asarray(draws.mean(0)), jnp.asarray(z)))
+        )
+        if not wrong.any():
+            break
+        z[wrong] = rng.standard_normal((int(wrong.sum()), own.size))
+    else:
+        raise InputError(
+            f"{REDRAWS} draws of a particle's law, none monotone", remedy="The calibrated scatter is too large."
+        )
+    kept = jnp.asarray(z)
+
+    def packing_of(values: Array) -> Packing:
+        return spheres(laws(values, kept), size, density)
+
+    packing_of(jnp.asarray(draws.mean(0)))  # refuses here, by name, effects that no contact can have
+    return PopulationPacking(packing_of, draws, names)
+
+
+def first_order_band(
+    packing_of: PackingOf,
+    draws: Float[np.ndarray, "draws parameters"],
+    state: State,
+    heights: Float[np.ndarray, " rows"],
+    *,
+    probability: Sequence[float] = PROBABILITY,
+    solver: Solver | None = None,
+) -> Band:
+    r"""Band from one compaction at the mean of the draws and its sensitivities (delta method).
+
+    .. math:: F_p = F(\bar\theta) + z_p\,\sqrt{J \Sigma J^T}, \qquad J = \partial F / \partial\theta
+
+    Args:
+        packing_of: the packing as a function of the parameters.
+        draws: of the parameters.
+        state, heights, solver: as for `compact`.
+        probability: of the quantiles.
+    """
+    draws = _checked(draws, probability)
+    mean = draws.mean(axis=0)
+    packing, tape = packing_of(jnp.asarray(mean)), list[LoadStep]()
+    _, rows = compact(packing, state, heights, solver, tape)
+    found = punch_sensitivity(packing_of, mean, state, tape, solver)
+    variance = np.einsum("ra,ab,rb->r", found.by_parameter, np.atleast_2d(np.cov(draws.T)), found.by_parameter)
+    deviation = np.sqrt(np.maximum(variance, 0.0))
+    z = np.array([NormalDist().inv_cdf(p) for p in probability])
+    return Band(
+        rows.height,
+        rows.density,
+        np.asarray(probability, float),
+        rows.top + z[:, None] * deviation,
+        deviation,
+        found.converged.astype(int),
+        int(not_monotone(packing).sum()),
+        compaction=rows,
+        sensitivity=found,
+    )
+
+
+def band_by_draws(
+    packing_of: PackingOf,
+    draws: Float[np.ndarray, "draws parameters"],
+    state: State,
+    heights: Float[np.ndarray, " rows"],
+    *,
+    probability: Sequence[float] = PROBABILITY,
+    solver: Solver | None = None,
+) -> Band:
+    """Band from one whole compaction for each draw: no linearisation, snaps and all; else as `first_order_band`.
+
+    Raises:
+        InputError: if no draw converged in a row.
+    """
+    draws = _checked(draws, probability)
+    packings = [packing_of(jnp.asarray(values)) for values in draws]
+    every = [compact(packing, state, heights, solver)[1] for packing in packings]
+    wrong = max(int(not_monotone(packing).sum()) for packing in packings)
+    # A row that did not settle hands its history on.
+    forces = np.stack([np.where(np.logical_and.accumulate(rows.converged), rows.top, np.nan) for rows in every])
+    rows = every[0]
+    used = np.isfinite(forces).sum(axis=0)
+    if (used == 0).any():
+        raise InputError(
+            f"no draw converged at the height {rows.height[np.argmin(used)]:.6g} m",
+            remedy="Smaller load steps, or more halvings (`Solver.halvings`).",
+        )
+    return Band(
+        rows.height,
+        rows.density,
+        np.asarray(probability, float),
+        np.nanquantile(forces, np.asarray(probability, float), axis=0),
+        _deviation(forces),
+        used,
+        wrong,
+        forces=forces,
+    )
+
+
+def _deviation(forces: np.ndarray) -> np.ndarray:
+    """Standard deviation of the draws that converged; nothing is known of it from one."""
+    used = np.isfinite(forces).sum(axis=0)
+    spread = np.nansum((forces - np.nanmean(forces, axis=0)) ** 2, axis=0)
+    return np.where(used > 1, np.sqrt(spread / np.maximum(used - 1, 1)), np.inf)
+
+
+def _checked(draws: np.ndarray, probability: Sequence[float]) -> np.ndarray:
+    draws = arguments.floats(draws, "draws", shape="a table with one row for each draw")
+    if draws.ndim != 2 or len(draws) < 2 or not np.isfinite(draws).all():
+        raise InputError("draws that are not a table of two or more finite rows", remedy="One row for each draw.")
+    if not all(0 < p < 1 for p in probability):
+        raise InputError(f"a probability outside 0 to 1 in {tuple(probability)}", remedy="For example 0.05, 0.5, 0.95.")
+    return draws
+
+
+class CompactionFit(NamedTuple):
+    """Parameters fitted to a compaction curve.
+
+    Attributes:
+        values, compaction: the parameters, and the rows of the compaction with them.
+        misfit: root mean square of force minus measured force, over the largest measured force [-].
+        rounds: compactions made again on the way.
+        converged: whether the last round no longer changed the parameters and every row is in equilibrium.
+    """
+
+    values: np.ndarray
+    compaction: Compaction
+    misfit: float
+    rounds: int
+    converged: bool
+
+    __repr__ = described()
+
+
+def fit_compaction(
+    packing_of: PackingOf,
+    start: Any,
+    state: State,
+    heights: Any,
+    force: Any,
+    *,
+    solver: Solver | None = None,
+    tolerance: float = 1e-7,
+) -> CompactionFit:
+    r"""Parameters whose compaction curve comes closest to a measured one, by Levenberg-Marquardt.
+
+    .. math:: \min_\theta \sum_r \left(\frac{F_r(\theta) - F_r}{\max F}\right)^2
+
+    with the sensitivities of the load steps. Within a round the load steps are those of a compaction at the round's
+    start (`replay_compaction`); rounds go on until the parameters stay, because contacts may snap elsewhere. Take
+    logarithms of positive parameters. The modulus needs rows of unloading.
+
+    Args:
+        packing_of: the packing as a function of the parameters; traced by JAX.
+        start: where to start.
+        state, heights, solver: as for `compact`.
+        force: on the top punch at the heights [N].
+        tolerance: of the parameters, relative and absolute.
+
+    Raises:
+        InputError: if heights and forces are not equally many, or fewer than the parameters.
+    """
+    solver = solver or Solver()
+    tolerance = arguments.number(tolerance, "tolerance", above=0)
+    values = arguments.path(start, "start")
+    measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")
+    if (
+        measured.ndim != 1
+        or measured.shape != np.shape(heights)
+        or len(measured) < len(values)
+        or not np.isfinite(measured).all()
+    ):
+        raise InputError(
+            f"{measured.size} forces for {len(np.atleast_1d(heights))} heights and {len(values)} parameters",
+            remedy="One finite force for each height, and no fewer than parameters.",
+        )
+    if not measured.max() > 0:
+        raise InputError("a compaction curve without a positive force", remedy="Forces are in newtons.")
+    target, settled, rounds = jnp.asarray(measured), False, 0
+    while not settled and rounds < ROUNDS:
+        tape: list[LoadStep] = []
+        compact(packing_of(values), state, heights, solver, tape)
+        before, rounds = values, rounds + 1
+        values = _least_squares(packing_of, values, state, stacked(tape), target, solver, tolerance)
+        settled = bool(jnp.all(jnp.abs(values - before) <= 10 * tolerance * (1 + jnp.abs(values))))
+    _, rows = compact(packing_of(values), state, heights, solver)
+    misfit = float(np.sqrt(np.mean(((rows.top - measured) / measured.max()) ** 2)))
+    return CompactionFit(np.asarray(values), rows, misfit, rounds, settled and bool(rows.converged.all()))
+
+
+@eqx.filter_jit
+def _least_squares(
+    packing_of: PackingOf, start: Array, state: State, steps: LoadStep, target: Array, solver: Solver, tolerance: float
+) -> Array:
+    ends = jnp.nonzero(steps.last, size=len(target))[0]
+
+    def residuals(values: Array, _: None) -> Array:
+        replayed = replay_stacked(packing_of(values), state, steps, solver)
+        return (replayed.on_wall[ends, TOP] - target) / jnp.max(target)
+
+    method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    return optx.least_squares(residuals, method, start, max_steps=64, throw=False).value
