@@ -78,7 +78,7 @@ def test_the_paper_calls_D1_major_although_it_is_often_the_smaller(particles):
 
 
 def test_effective_and_mean_diameter_are_not_proportional(particles):
-    effective, _, _, _, _, mean = eqx.filter_vmap(sizes_and_shapes, in_axes=(0, None))(particles, A)
+    effective, *_, mean = eqx.filter_vmap(sizes_and_shapes, in_axes=(0, None))(particles, A)
     effective, mean = np.asarray(effective), np.asarray(mean)
     check(np.mean(mean / effective), "0.77864")
     check(np.std(mean / effective, ddof=1), "0.1164")

@@ -134,7 +134,7 @@ def examples(folder: Path) -> dict[str, Example]:
             run=False,
         ),
         "least_squares": Example(
-            mcc.least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0, block=1, run=False
+            mcc.least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0, run=False
         ),
         "sample": Example(
             mcc.sample,

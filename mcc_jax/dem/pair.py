@@ -160,7 +160,7 @@ class _Series(NamedTuple):
 
 
 def _recovered(i: HalfContact, j: HalfContact, series: _Series) -> Scalar:
-    return sum(side.at_peak(d).recovered(d).span for side, d in ((i, series.d_i), (j, series.d_j)))
+    return i.at_peak(series.d_i).recovered(series.d_i).span + j.at_peak(series.d_j).recovered(series.d_j).span
 
 
 @jax.custom_jvp

@@ -379,7 +379,7 @@ def fit_compaction(
     """
     solver = solver or Solver()
     tolerance = arguments.number(tolerance, "tolerance", above=0)
-    values = arguments.path(start, "start")
+    values, heights = arguments.path(start, "start"), arguments.path(heights, "heights")
     measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")
     if (
         measured.ndim != 1
@@ -388,7 +388,7 @@ def fit_compaction(
         or not np.isfinite(measured).all()
     ):
         raise InputError(
-            f"{measured.size} forces for {len(np.atleast_1d(heights))} heights and {len(values)} parameters",
+            f"{measured.size} forces for {len(heights)} heights and {len(values)} parameters",
             remedy="One finite force for each height, and no fewer than parameters.",
         )
     if not measured.max() > 0:
