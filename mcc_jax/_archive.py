@@ -137,7 +137,7 @@ def _built(value: Any) -> Any:
         array = np.frombuffer(value["bytes"], np.dtype(value["dtype"])).reshape(value["shape"])
         if value["array"] == "scalar":
             return array[()]
-        return jnp.asarray(array) if value["array"] == "jax" else array.copy()
+        return jnp.asarray(array) if value["array"] == "jax" else array  # NumPy's arrays cannot be written to
     if "mapping" in value:
         return {_built(key): _built(item) for key, item in value["mapping"]}
     if "tuple" in value:

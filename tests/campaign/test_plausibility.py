@@ -17,6 +17,7 @@ from mcc_jax.campaign import (
     Campaign,
     Curve,
     check_plausibility,
+    read_campaign,
     read_tester_file,
 )
 from mcc_jax.simulate import Instrument, Programme, paper_campaign
@@ -172,6 +173,63 @@ def says(findings, kind):
 def test_no_slip_no_accusation(name):
     for seed in range(10):
         assert not accusing(check_plausibility(made(name, seed)))
+
+
+# Twelve errors as they happen in files: the units that the headers name, and by what the right numbers were multiplied.
+TWELVE = {
+    "mN as N": ({"force": "N"}, {}, "The forces seem 1000 times too large"),
+    "N as mN": ({}, {"force": 1e-3}, "The forces seem 1000 times too small, as N taken for mN"),
+    "uN as mN": ({}, {"force": 1e3}, "The forces seem 1000 times too large, as uN taken for mN"),
+    "um as mm": ({"displacement": "mm"}, {}, "The displacements seem 1000 times too large"),
+    "mm as um": ({}, {"displacement": 1e-3}, "The displacements seem 1000 times too small, as mm taken for um"),
+    "nm as um": ({}, {"displacement": 1e3}, "The displacements seem 1000 times too large, as nm taken for um"),
+    "swapped": ({}, {"force": "displacement", "displacement": "force"}, "Force and displacement seem to be swapped"),
+    "forces negated": ({}, {"force": -1.0}, "The forces of all tests seem to have the wrong sign"),
+    "displacements negated": ({}, {"displacement": -1.0}, "The displacements of all tests seem to have the wrong sign"),
+    "diameters in um as mm": ({"D": "mm"}, {}, "The diameters seem 1000 times too large"),
+    "diameters in mm as um": ({}, {"D": 1e-3}, "The diameters seem 1000 times too small, as mm taken for um"),
+    "ms as s": ({}, {"time": 1e3}, "The times seem 1000 times too large, as ms taken for s"),
+}
+
+
+def written(tests, folder, units, numbers):
+    """The campaign from files whose headers name `units` and whose columns are `numbers` times the right ones."""
+    unit = {"time": "s", "force": "mN", "displacement": "um", "D": "um"} | units
+    rows = []
+    for name, curve in zip(tests.particles, tests.curves, strict=True):
+        right = {"time": curve.time_s, "force": curve.force_mN, "displacement": curve.displacement_um}
+        factors = ((key, numbers.get(key, 1.0)) for key in right)
+        columns = [right[by] if isinstance(by, str) else by * right[key] for key, by in factors]
+        rows += [f"{name},{t:.12g},{F:.12g},{way:.12g}" for t, F, way in zip(*columns, strict=True)]
+    sizes = [
+        ",".join([name, *(f"{numbers.get('D', 1.0) * d:.12g}" for d in row)])
+        for name, row in zip(tests.particles, tests.diameters_um, strict=True)
+    ]
+    head = ",".join(f"{key}_{unit[key]}" for key in ("time", "force", "displacement"))
+    (folder / "curves.csv").write_text("\n".join([f"particle,{head}", *rows]))
+    (folder / "particles.csv").write_text("\n".join([f"particle,D1_{unit['D']},D2_{unit['D']},D3_{unit['D']}", *sizes]))
+    return read_campaign(folder)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: cellulose(7, count=5, retreat=0.13),
+        lambda: cellulose(8, count=5, retreat=0.04),
+        lambda: ceramic(7, count=5),
+        lambda: ceramic(8, count=5, modulus_MPa=3e5, unloads=False),
+    ],
+    ids=["cellulose, 5 GPa", "cellulose, 16 GPa", "ceramic, 100 GPa", "ceramic, 300 GPa, broken"],
+)
+def test_twelve_of_twelve_unit_errors_of_files_are_named(make, tmp_path):
+    tests = make()
+    assert not accusing(check_plausibility(written(tests, tmp_path, {}, {})))
+    named = []
+    for kind, (units, numbers, sentence) in TWELVE.items():
+        findings = check_plausibility(written(tests, tmp_path, units, numbers))
+        if len(findings) == 1 and findings[0].level == "error" and findings[0].sentence.startswith(sentence):
+            named.append(kind)
+    assert named == list(TWELVE)
 
 
 def test_the_remedy_holds_whatever_unit_the_file_names():
