@@ -315,7 +315,7 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
 def test_every_verdict_is_told(folder, verdict, words):
     keep(folder, "discovery")
     empty = {"effects": [], "candidate_set": [], "where": [], "next_experiments": [], "parameters_after": {}}
-    closure = {"formula": "0.1 * x**2", "resembles": [["creep", 0.7]]}
+    closure = {"formula": "0.1 * x**2", "resembles": [["creep", 0.7]], "selection_frequency": 0.9}
     more = {"NO_GAP": empty, "UNLISTED": empty | {"closure": closure}, "FIT_NOT_CONVERGED": empty | {"ranking": []}}
     text = Page(report_page(changed(folder, "discovery.msgpack", verdict=verdict, **more.get(verdict, {})))).text
     assert words in text
