@@ -20,6 +20,7 @@ TABLE_BYTES = 256 * 2**20  # `curves.csv` or an export: 7 million readings, 20 p
 SETTINGS_BYTES = 2**20  # a TOML file: the diameters of 20,000 tests
 RESULT_BYTES = 16 * 2**20  # `calibration.json`, `discovery.json`: 1000 particles take half a MiB
 POSTERIOR_BYTES = 4 * 2**30  # 4000 draws of 1000 particles with 100 compared points each are 3 GiB
+CHUNK = 2**20
 UNPACKED_BYTES = 512 * 2**20  # what a zip archive of tests or a workbook unpacks to
 
 
@@ -59,10 +60,13 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
 
 def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> bytes:
     """The bytes of a regular file; see `open_regular` for what is refused."""
+    chunks, size = [], 0
     with open_regular(path, most_bytes, remedy) as stream:
-        data = stream.read(most_bytes + 1)
-    _refuse_size(len(data), most_bytes, Path(path), remedy)  # it may have grown
-    return data
+        while chunk := stream.read(CHUNK):  # all at once, the limit itself would be allocated
+            size += len(chunk)
+            _refuse_size(size, most_bytes, Path(path), remedy)  # it may grow meanwhile
+            chunks.append(chunk)
+    return b"".join(chunks)
 
 
 def _refuse_size(size: int, most: int, file: Path, remedy: str) -> None:
