@@ -86,7 +86,9 @@ def run(
     """Steps on one list of edges, as one compiled loop, differentiable in both modes.
 
     Args:
-        packing, motion, state: spheres, time step with damping and friction, and where to start.
+        packing: the spheres.
+        motion: time step, damping and friction.
+        state: where to start.
         steps: length of the loop.
         wanted: how many of these steps are taken.
         devices: over which the contacts are divided (`jax.devices()`); not divided if None.
@@ -145,7 +147,9 @@ def advance(
     """Move on for a time, with a new list of edges whenever a particle has moved by half the skin.
 
     Args:
-        packing, motion, state: spheres, time step with damping and friction, and where to start.
+        packing: the spheres.
+        motion: time step, damping and friction.
+        state: where to start.
         velocity: of each wall [m/s].
         rows: how often something is measured.
         steps: steps from one row to the next.
@@ -202,7 +206,8 @@ def replay(
     are chaotic (see `compact`).
 
     Args:
-        packing, motion: as in `advance`.
+        packing: as in `advance`.
+        motion: as in `advance`.
         state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
         tape: of one call of `advance`.
         devices: as in `run`.

@@ -75,7 +75,8 @@ def close_pairs(position: Any, radius: Any, skin: float) -> Int[np.ndarray, "pai
     By `vesin` if it is installed (``pip install mcc-jax[neighbours]``), else by SciPy's k-d tree; the same pairs.
 
     Args:
-        position, radius: centres and radii [m].
+        position: centres [m].
+        radius: radii [m].
         skin: extra distance [m]. No pair can touch unseen until a particle has moved by half of it.
 
     Raises:

@@ -50,7 +50,8 @@ def scattered(
 
     Args:
         key: random key.
-        radius, die_radius: [m].
+        radius: of the spheres [m].
+        die_radius: of the die [m].
         gap: least distance between surfaces, as a share of the largest radius.
     """
     radius = arguments.path(radius, "radius", many="Give one radius [m] for each sphere.")

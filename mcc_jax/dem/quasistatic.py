@@ -143,7 +143,8 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
     overlap is left is where the compaction begins. Scatter the spheres first (`scattered`) and lower them into the die.
 
     Args:
-        packing, walls: the spheres and the walls.
+        packing: the spheres.
+        walls: the walls.
         position: centres [m]; may overlap.
         solver: skin, tolerance and steps.
         passes: how many steps at most.
@@ -370,7 +371,9 @@ def replay_compaction(
 
     Args:
         packing: the spheres, for example as a function of the law's parameters under `jax.jvp`.
-        state, tape, solver: start, load steps and solver of `compact`.
+        state: start of `compact`.
+        tape: its load steps.
+        solver: its solver.
     """
     return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), solver or Solver())
 

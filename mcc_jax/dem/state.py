@@ -98,7 +98,8 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
     """A state at rest: virgin contacts, a fresh list of edges.
 
     Args:
-        packing, walls: the spheres and the walls.
+        packing: the spheres.
+        walls: the walls.
         position: centres [m].
         skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
         capacity: length of the list of edges; a tenth more than there are pairs if None.

@@ -85,7 +85,9 @@ def punch_sensitivity(
     Args:
         packing_of: the packing as a function of parameters; at `values` the one that made the tape.
         values: parameters [any units].
-        state, tape, solver: start, load steps and solver of `compact`.
+        state: start of `compact`.
+        tape: load steps of `compact`.
+        solver: of `compact`.
     """
     if not callable(packing_of):
         raise InputError(f"packing_of must be a function of the values, got {arguments.kind_of(packing_of)}")
@@ -251,7 +253,9 @@ def first_order_band(
     Args:
         packing_of: the packing as a function of the parameters.
         draws: of the parameters.
-        state, heights, solver: as for `compact`.
+        state: as for `compact`.
+        heights: as for `compact`.
+        solver: as for `compact`.
         probability: of the quantiles.
     """
     draws = _checked(draws, probability)
@@ -370,7 +374,9 @@ def fit_compaction(
     Args:
         packing_of: the packing as a function of the parameters; traced by JAX.
         start: where to start.
-        state, heights, solver: as for `compact`.
+        state: as for `compact`.
+        heights: as for `compact`.
+        solver: as for `compact`.
         force: on the top punch at the heights [N].
         tolerance: of the parameters, relative and absolute.
 

@@ -74,7 +74,8 @@ def jax_artefact(
         force, tangent, *memory = step(displacement, time, *memory)
 
     Args:
-        law, particle: their numbers become constants (the particle's not for `step_each`).
+        law: its numbers become constants.
+        particle: its numbers become constants, but for `step_each`.
         which: `force`, `step` (force, tangent, history) or `step_each` (the same, sizes and C1, C3, C5 as arguments);
             of a law with effects `step`, `step_each` or `step_load` (displacement under a force).
         dtype: precision of arguments, results and constants; float64 needs `jax_enable_x64` here and where it runs.
