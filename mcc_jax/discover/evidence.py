@@ -70,10 +70,6 @@ def scales_of(hyper: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray
     return np.concatenate([tau[:4], [1.0], tau[4:]]), misfit[design.group]
 
 
-def _factor(hyper: np.ndarray, design: Design) -> np.ndarray:
-    return np.concatenate([*scales_of(hyper, design), np.ones(design.amplitude.shape[-1] + 1)])
-
-
 def _scaled(form: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Quadratic forms whose columns are scaled."""
     return form * factor * factor[:, None]
@@ -198,18 +194,14 @@ def value_and_gradient(hyper: np.ndarray, design: Design, *, of_noise: bool = Tr
     """
     spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
-        plain, log_density = design.columns.gram(hyper)
-        factor = _factor(hyper, design)
-        gram = _scaled(plain, factor)
-        by_particle = marginalise(gram, o)
-        common, effects, of_schur = _of_shared(by_particle.schur.sum(0), design)
+        model = LinearModel(hyper, design)
+        common, effects, of_schur = _of_shared(model.particles.schur.sum(0), design)
         prior, slope = log_prior(hyper, design)
-        integrals = by_particle.log_integral + log_density
-        value = float(integrals.sum() + common) + effects + prior
-        of_gram = by_particle.slope(of_schur)
+        value = float(model.log_integral.sum() + common) + effects + prior
+        of_gram = model.particles.slope(of_schur)
         if of_noise:
-            slope[:4] += design.columns.slope(hyper, _scaled(of_gram, factor))
-        of_log = 2 * np.sum(of_gram * gram, (0, 2))  # derivatives by the logarithms of the columns' scales
+            slope[:4] += design.columns.slope(hyper, _scaled(of_gram, model.factor))
+        of_log = 2 * np.sum(of_gram * model.gram, (0, 2))  # derivatives by the logarithms of the columns' scales
         spread = spreads_of(hyper[4 : 4 + len(spreads)], spreads)
         own = np.delete(of_log[:o], 4)
         slope[4 : 4 + len(spreads)] += own * spread.slope / np.maximum(spread.value, 1e-300)
@@ -221,11 +213,10 @@ class OfMisfits:
     """The log joint density as a function of the misfits' scales alone: at fixed noise and spreads it costs nothing."""
 
     def __init__(self, hyper: np.ndarray, design: Design) -> None:
-        o, c = design.own.shape[-1], design.common.shape[-1]
+        o = design.own.shape[-1]
         self.design, self.fixed = design, hyper[: 4 + len(design.kinds.spreads)]
         gram, log_density = design.columns.gram(hyper)
-        factor = _factor(hyper, design)
-        factor[o : o + c] = 1.0
+        factor = np.concatenate([scales_of(hyper, design)[0], np.ones(len(gram[0]) - o)])
         by_particle = marginalise(_scaled(gram, factor), o)
         self.gram, self.integrals = by_particle.schur.sum(0), float((by_particle.log_integral + log_density).sum())
 
@@ -262,7 +253,8 @@ class LinearModel:
     def __init__(self, hyper: np.ndarray, design: Design) -> None:
         gram, log_density = design.columns.gram(hyper)
         self.hyper, self.design, self.scales = hyper, design, scales_of(hyper, design)
-        self.gram = _scaled(gram, _factor(hyper, design))
+        self.factor = np.concatenate([*self.scales, np.ones(design.amplitude.shape[-1] + 1)])
+        self.gram = _scaled(gram, self.factor)
         self.particles = marginalise(self.gram, design.own.shape[-1])
         self.log_integral = self.particles.log_integral + log_density
 

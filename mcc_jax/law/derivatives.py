@@ -312,12 +312,15 @@ def signatures(
     for i, effect in enumerate(effects):
         groups.setdefault((type(effect), jax.tree.structure(effect)), []).append(i)
     within: list[tuple[list[int], Any, Path]] = []
-    beside: list[tuple[list[int], Path]] = []
+    after: list[tuple[list[int], Path]] = []
     for members in groups.values():
         alike = [jax.tree.map(jnp.asarray, effects[i]) for i in members]
         inside, added = jax.vmap(changes)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike))
-        beside.append((members, added)) if inside is None else within.append((members, inside, added))
-    rows = [added for _, added in beside]
+        if inside is None:
+            after.append((members, added))
+        else:
+            within.append((members, inside, added))
+    rows = [added for _, added in after]
     if within:
         parameters, rest = eqx.partition(formulas, eqx.is_inexact_array)
 
@@ -327,7 +330,7 @@ def signatures(
         _, push = jax.linearize(response, parameters, jnp.zeros_like(strain), jnp.ones_like(strain))
         directions = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(inside for _, inside, _ in within))
         rows.append(jax.vmap(push)(*directions) + jnp.concatenate([added for _, _, added in within]))
-    order = [i for members, *_ in (*beside, *within) for i in members]
+    order = [i for members, *_ in (*after, *within) for i in members]
     return jnp.concatenate(rows)[np.argsort(order)]
 
 
