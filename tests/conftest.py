@@ -101,7 +101,9 @@ def mark_further_cases(items):
     seen = set()
     for item in items:
         test = item.nodeid.split("[")[0]
-        if test in seen and not item.nodeid.startswith(EVERY_CASE):
+        if item.get_closest_marker("extended") or item.nodeid.startswith(EVERY_CASE):
+            continue
+        if test in seen:
             item.add_marker(pytest.mark.extended)
         seen.add(test)
 

@@ -33,14 +33,8 @@ K1, K3, K5, A, EBAR = 7.0094, 27.235, 144.23, 1.43, 16000.0
 FORMS = [(u, s) for u in Unloading for s in StrainScaling]
 FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]
 ALL_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
-# Each form and each way of the shape factor once, for derivatives, which compile for long: the core takes the first.
-SOME = [pytest.param(*f, marks=pytest.mark.extended if i else ()) for i, f in enumerate(FORMS[::4])]
-SOME_FORMS = pytest.mark.parametrize(("unloading", "scaling"), SOME, ids=FORM_NAMES[::4])
-
-
-def first_in_core(values, keep=1):
-    """Parameters of which the core takes the first; the others are `extended`."""
-    return [v if i < keep else pytest.param(v, marks=pytest.mark.extended) for i, v in enumerate(values)]
+# Each form and each way of the shape factor once, for derivatives, which compile for long.
+SOME_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS[::4], ids=FORM_NAMES[::4])
 
 
 EPS = {np.dtype("float64"): 2.0**-52, np.dtype("float32"): 2.0**-23}

@@ -340,4 +340,9 @@ def _one_effect(effect: Any) -> AbstractEffect:
         effect = find_variant(effect)
     if isinstance(effect, Variant):
         return effect.build(effect.typical)
+    if not isinstance(effect, AbstractEffect):
+        remedy = 'Give a name such as "creep:logarithmic", a Variant, or what its build(amplitude) makes.'
+        raise InputError(
+            f"an effect must be a name, a Variant or an effect, got {arguments.kind_of(effect)}", remedy=remedy
+        )
     return effect

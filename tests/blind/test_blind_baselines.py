@@ -34,8 +34,8 @@ def made(name, place):
     [
         ("nothing", "NO_GAP", []),
         ("clear", "NAMED", ["thermal_drift"]),
-        pytest.param("bends with its amplitude", "NAMED", ["adhesion"], marks=pytest.mark.extended),
-        pytest.param("on no list", "UNLISTED", [], marks=pytest.mark.extended),
+        ("bends with its amplitude", "NAMED", ["adhesion"]),
+        ("on no list", "UNLISTED", []),
     ],
 )
 def test_the_oracle_knows(name, verdict, names, tmp_path):

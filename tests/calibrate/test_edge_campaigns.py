@@ -26,7 +26,7 @@ METHODS = {
     "least-squares": least_squares,
 }
 methods = pytest.mark.parametrize("method", list(METHODS))
-few = pytest.mark.parametrize("method", [pytest.param("bayes", marks=pytest.mark.extended), "least-squares"])
+few = pytest.mark.parametrize("method", ["least-squares", "bayes"])
 """The posterior compiles for every number of particles."""
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ALL_FORMS, first_in_core
+from helpers import ALL_FORMS
 from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, simulated, true_latent
 
 from mcc_jax import Instrument, Model, Programme, Unloading
@@ -58,7 +58,7 @@ def test_the_zero_is_subtracted_from_what_was_measured():
     [
         (PLAIN, ()),
         (CREEP, (3e-4, 10.0)),
-        pytest.param(Forms(Unloading.PUNCH_EXACT), (), marks=pytest.mark.extended),
+        (Forms(Unloading.PUNCH_EXACT), ()),
     ],
     ids=["plain", "creep", "punch"],
 )
@@ -96,9 +96,7 @@ def test_derivatives_are_finite_differences(law, theta):
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "names",
-    first_in_core(
-        [("rate_dependence", "damage"), ("size_effect", "creep:logarithmic"), ("platen_friction", "rate_dependence")]
-    ),
+    [("rate_dependence", "damage"), ("size_effect", "creep:logarithmic"), ("platen_friction", "rate_dependence")],
     ids="+".join,
 )
 def test_stages_joined_by_the_chain_rule_are_the_derivatives_of_the_whole_law(names):
@@ -124,7 +122,7 @@ def test_stages_joined_by_the_chain_rule_are_the_derivatives_of_the_whole_law(na
 
 @pytest.mark.extended
 @pytest.mark.parametrize(("law", "theta"), [(PLAIN, ()), (CREEP, (3e-4, 10.0))], ids=["plain", "creep"])
-@pytest.mark.parametrize("hum", [0.0, pytest.param(0.5, marks=pytest.mark.extended)], ids=["clean", "noisy"])
+@pytest.mark.parametrize("hum", [0.0, 0.5], ids=["clean", "noisy"])
 def test_how_errors_of_force_move_a_prediction(law, theta, hum):
     """By a point's own reading, by the peak of its branch, by an error that all forces share: each by differences."""
     tests = measured_with(instrument=Instrument(force_noise_mN=hum), peak_MPa=5.0)

@@ -5,7 +5,6 @@ import functools
 import faulty
 import numpy as np
 import pytest
-from helpers import first_in_core
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,7 +45,7 @@ def modulus(kind):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("kind", first_in_core(["offset and force", "path", "spiked", "broken"]))
+@pytest.mark.parametrize("kind", ["offset and force", "path", "spiked", "broken"])
 def test_the_modulus_holds_the_truth_and_is_as_sharp_as_the_clean_tests_allow(kind):
     low, high = modulus(kind)["interval_95"]
     clean_low, clean_high = modulus("clean")["interval_95"]

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import first_in_core
 from joint_cases import (
     COEFFICIENTS,
     DIAMETERS,
@@ -43,7 +42,7 @@ SCATTERS = {
 }
 scatters = pytest.mark.parametrize("scatter", list(SCATTERS.values())[:4], ids=list(SCATTERS)[:4])
 SOME = ["effects", "plain", "both-master"]
-extremes = pytest.mark.parametrize("scatter", first_in_core([SCATTERS[n] for n in SOME]), ids=SOME)
+extremes = pytest.mark.parametrize("scatter", [SCATTERS[n] for n in SOME], ids=SOME)
 
 latent_moments = eqx.filter_jit(moments)
 likelihood = eqx.filter_jit(lambda population, marginal: marginal.log_likelihood(population))
@@ -132,7 +131,7 @@ def test_the_likelihood_is_the_integral_over_the_particle(scatter, scale, tolera
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("scatter", first_in_core(SCATTERS.values()), ids=SCATTERS)
+@pytest.mark.parametrize("scatter", SCATTERS.values(), ids=SCATTERS)
 def test_the_likelihood_of_sharp_tests_is_the_dense_normal_one(scatter):
     """Where kappa is as good as the latent vector itself, all is normal; and draws are those of the conditional."""
     scale = 1e-6

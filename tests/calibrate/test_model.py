@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.handlers
 import pytest
-from helpers import first_in_core
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_cases import NOISE, random_marginal, simulated
@@ -31,7 +30,7 @@ from mcc_jax.effects import LIBRARY, find_variant
 
 EFFECTS = Model().with_effects("creep:logarithmic", "unloading_shape:symmetric_bow", varying="creep")
 MODELS = {"effects": EFFECTS, "plain": Model(modulus_scatter=True, shape_scatter=True)}
-models = pytest.mark.parametrize("model", first_in_core(list(MODELS.values())), ids=MODELS)
+models = pytest.mark.parametrize("model", list(MODELS.values()), ids=MODELS)
 FLAT = np.random.default_rng(0).uniform(0.05, 0.5, 12)
 
 
@@ -124,7 +123,7 @@ def test_potential_and_gradient_are_finite_from_prior_draws_on(model, tests):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("model", first_in_core([Model(modulus_scatter=True), EFFECTS]), ids=["plain", "effects"])
+@pytest.mark.parametrize("model", [Model(modulus_scatter=True), EFFECTS], ids=["plain", "effects"])
 def test_prior_draws_have_the_moments_of_the_priors(model, tests):
     count, p = 400, model.chosen_priors
 
@@ -193,7 +192,7 @@ def at_random(rng, model, scale=0.03):
     return replace(marginal, gram=marginal.gram * (unit * unit[:, None])[None])
 
 
-@pytest.fixture(scope="module", params=first_in_core(list(MODELS.values())), ids=MODELS)
+@pytest.fixture(scope="module", params=list(MODELS.values()), ids=MODELS)
 def target(request):
     return LogPosterior(request.param, at_random(np.random.default_rng(5), request.param))
 

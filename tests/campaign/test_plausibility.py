@@ -111,12 +111,12 @@ SLIPS = {
     "N as mN": ({"force": 1e-3}, "The forces seem 1000 times too small, as N taken for mN", "force_N"),
     "nm as um": (
         {"displacement": 1e3},
-        "The displacements .* large, as nm taken for um",
+        "The displacements seem 1000 times too large, as nm taken for um",
         "displacement_nm",
     ),
     "mm as um": (
         {"displacement": 1e-3},
-        "The displacements .* small, as mm taken for um",
+        "The displacements seem 1000 times too small, as mm taken for um",
         "displacement_mm",
     ),
     "diameters in mm": ({"diameters": (1e-3,) * 3}, "The diameters seem 1000 times too small", "D1_mm, D2_mm, D3_mm"),

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import first_in_core
 from test_pair_law import ON_PATH, PARTICLE, UM, WALL_PATH, cycle, driven, law_of
 
 from benchmarks import energy_paths
@@ -63,7 +62,7 @@ def test_two_halves_are_the_plate_test(unloading):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("variant", first_in_core(CLOSED, 6), ids=named)
+@pytest.mark.parametrize("variant", CLOSED, ids=named)
 def test_every_closed_effect_releases_as_the_law_does(variant):
     """From a peak under load control, which is in closed form: where the platen is at shares of the peak force."""
     law = law_of()._with((variant.build(variant.typical),))
@@ -115,7 +114,7 @@ def test_force_is_continuous(unloading):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("unloading", first_in_core(Unloading))
+@pytest.mark.parametrize("unloading", Unloading)
 def test_no_path_of_a_pair_gains_energy(unloading):
     """Random paths to twice the tested range with damage and densification; sides that would gain are left out."""
     law, particle = energy_paths.draw(8, 400, unloading, StrainScaling.RAW)
@@ -178,7 +177,7 @@ def pair_of(unloading):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("unloading", first_in_core(Unloading))
+@pytest.mark.parametrize("unloading", Unloading)
 @pytest.mark.parametrize(("peak", "share"), [(0.0, 25.0), (25.0, 0.999), (25.0, 0.99), (50.0, 0.985)])
 def test_derivatives_equal_differences(unloading, peak, share):
     """T7: by every number of the sides, those of effects included, on loading and unloading, both modes."""

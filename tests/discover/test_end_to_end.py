@@ -15,7 +15,7 @@ QUICK = {"confirm": False, "experiments": False, "posterior": False}
 COMPLIANCE = 0.004
 
 
-@pytest.fixture(scope="module", params=["few", pytest.param("all", marks=pytest.mark.extended)])
+@pytest.fixture(scope="module", params=["few", "all"])
 def named(request):
     """What is found among few mechanisms, and among all."""
     few = {name: LIBRARY[name] for name in ("frame_compliance", "damage")} if request.param == "few" else None

@@ -15,22 +15,12 @@ from mcc_jax.effects import LIBRARY
 EVERY = pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 
 
-# A quick run takes the first formula of each mechanism.
-FIRST = pytest.mark.parametrize(
-    "variant",
-    [
-        pytest.param(v, id=name, marks=() if v is LIBRARY[v.mechanism].variants[0] else pytest.mark.extended)
-        for v, name in zip(VARIANTS, NAMES, strict=True)
-    ],
-)
-
-
 @functools.cache
 def base_response():
     return np.asarray(LAW.path_load(PARTICLE, LAW.init(PARTICLE), FORCE)[1])
 
 
-@FIRST
+@EVERY
 def test_null_is_the_base_law(variant):
     np.testing.assert_allclose(lanes(variant)[0][0], base_response(), rtol=1e-12)
 

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
-from helpers import first_in_core
 from test_c_header import history, random_laws, random_paths, scales
 from test_recipes import run_recipe
 from test_tables import assert_rebuilt
@@ -66,7 +65,7 @@ def along(law, diameters, others, path, peak, kind):
 
 
 @pytest.mark.parametrize("names", [*NAMED.values(), Softer(0.4)], ids=[*NAMED, "own"])
-@pytest.mark.parametrize("unloading", first_in_core([Unloading.PRINTED, Unloading.PUNCH_EXACT]))
+@pytest.mark.parametrize("unloading", [Unloading.PRINTED, Unloading.PUNCH_EXACT])
 def test_c_equals_the_library_over_random_paths(tmp_path, unloading, names):
     """Random coefficients, moduli and shapes under one header, platens, wall and unlike pairs, to twice the tests."""
     rng, count, steps = np.random.default_rng(5), 300, 24
@@ -102,7 +101,7 @@ def test_recipes_give_the_headers_forces(tmp_path, recipe):
     assert "Effect damage:exponential: E exp(-kappa eps_P); damage_rate = 0.447214." in text
 
 
-@pytest.mark.parametrize("names", first_in_core(NAMED.values()), ids=NAMED)
+@pytest.mark.parametrize("names", NAMED.values(), ids=NAMED)
 def test_the_law_rebuilt_from_the_tables_alone(names):
     law, particle = paper_law(Unloading.PUNCH, StrainScaling.CONTACT), Particle(213.54, 196.07, 150.0)
     law = type(law)(law.plastic, law.a, 500.0, law.unloading, law.strain_scaling).with_effects(*names)

@@ -36,9 +36,7 @@ REFUSED = (
 FILES = ("a force that is text", "cut off in the middle of a row", "a diameter of zero", "rows of two tests mixed up")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.extended if i else ()) for i, name in enumerate(FITTED)]
-)
+@pytest.mark.parametrize("name", FITTED)
 def test_ends_in_a_result(name):
     found = run_one(BY_NAME[name], 1, "least-squares")
     assert (found.how, found.fault) in [("converged", ""), ("not converged", "")], found
@@ -46,11 +44,7 @@ def test_ends_in_a_result(name):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(kind.name, marks=() if kind.name.startswith("100 ") else pytest.mark.extended)
-        for kind in KINDS
-        if " cycles" in kind.name
-    ],
+    [kind.name for kind in KINDS if " cycles" in kind.name],
 )
 def test_hundreds_of_cycles_are_selected(name):
     campaign = campaign_of(BY_NAME[name], 0)

@@ -117,6 +117,7 @@ def test_a_variant_of_ones_own_goes_the_same_way():
     [
         (("rust",), "there is no mechanism 'rust'"),
         (("creep:cubic",), "creep has no variant 'cubic'"),
+        ((3.0,), "an effect must be"),
     ],
 )
 def test_what_is_no_effect_is_refused_by_name(effects, words):

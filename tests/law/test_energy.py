@@ -12,7 +12,6 @@ from helpers import (
     all_finite,
     between,
     close,
-    first_in_core,
     force_along,
     paper_law,
     paper_particle,
@@ -103,7 +102,7 @@ def test_further_loading_counts_from_the_new_peak():
 
 @pytest.mark.extended
 @SOME_FORMS
-@pytest.mark.parametrize("mode", first_in_core([jax.jacrev, jax.jacfwd]))
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_energy_is_finite_with_its_derivatives_everywhere(unloading, scaling, mode, dtype):
     theta = jnp.asarray([7.0, 3.0, 2.7, 1.43, 16000.0, 200.0, 210.0, 160.0], dtype)

@@ -11,7 +11,6 @@ from helpers import (
     all_finite,
     between,
     close,
-    first_in_core,
     master_strain,
     master_stress,
     paper_particle,
@@ -138,7 +137,7 @@ def test_behind_the_peak_there_is_no_way_back():
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("dtype", first_in_core([jnp.float64, jnp.float32]))
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_a_tensile_quintic_carries_nothing(dtype, mode):
     """K3^2 > 4 K1 K5: pushed into the range where the polynomial pulls, the particle has no force and no stiffness."""

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
-from helpers import first_in_core
 from matplotlib._pylab_helpers import Gcf
 from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.image import imread
@@ -32,7 +31,7 @@ from mcc_jax.plots import (
 from mcc_jax.plots.paper import adjusted_curve, dimensions, law_strain, stretches_outside
 from mcc_jax.plots.style import shape_factors
 
-KINDS = first_in_core(["paper", "cycles", "two", "dropped", "many"])
+KINDS = ["paper", "cycles", "two", "dropped", "many"]
 UNIT = re.compile(r"\[(MPa|GPa|mN|µm|-)\]$")
 
 

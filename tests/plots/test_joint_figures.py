@@ -35,7 +35,7 @@ from mcc_jax.plots.posterior import (
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
-KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.extended) for kind in ("one", "odd")))
+KINDS = ("paper", "one", "odd")
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
 UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
 

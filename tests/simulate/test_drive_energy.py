@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import between, first_in_core
+from helpers import between
 from hypothesis import given, settings
 
 from benchmarks import energy_paths
@@ -91,8 +91,8 @@ def largest_gain(response):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("unloading", first_in_core([Unloading.PUNCH, Unloading.PRINTED, Unloading.PUNCH_EXACT]))
-@pytest.mark.parametrize("variant", first_in_core(AT_PEAK, 2), ids=lambda v: f"{v.mechanism}:{v.name}")
+@pytest.mark.parametrize("unloading", [Unloading.PUNCH, Unloading.PRINTED, Unloading.PUNCH_EXACT])
+@pytest.mark.parametrize("variant", AT_PEAK, ids=lambda v: f"{v.mechanism}:{v.name}")
 @settings(max_examples=40)
 @given(
     amplitude=between(-6.0, 12.0),
