@@ -60,7 +60,7 @@ def _test(effects=()):
     import mcc_jax as mcc
 
     law = mcc.paper_law()
-    laws = mcc.law_for_each(
+    laws = mcc.simulate.law_for_each(
         plastic=jax.tree.map(lambda x: x[None], law.plastic), a=law.a, effective_modulus_MPa=law.effective_modulus
     )
     particle = mcc.Particle(*DIAMETERS_UM)

@@ -31,8 +31,8 @@ def public_names(module: str) -> list[tuple[str, str]]:
     folder = PACKAGE.joinpath(*module.split(".")[1:])
     file = next(f for f in (folder / "__init__.pyi", folder / "__init__.py", folder.with_suffix(".py")) if f.exists())
     body = ast.parse(file.read_text(encoding="utf-8")).body
-    # `from . import discover` has no module: the package called `discover` holds the function of that name.
-    return [(a.name, n.module or a.name) for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
+    # `from . import calibrate` names a package, which has a page of its own.
+    return [(a.name, n.module) for n in body if isinstance(n, ast.ImportFrom) and n.module for a in n.names]
 
 
 def on_files(files, config, **_):

@@ -87,7 +87,7 @@ def segments():
     campaign = mcc.paper_campaign(0, programme=CYCLES)
     curve = campaign.curves[0]
     figure, ax = panel("time / s", MN)
-    for part in mcc.find_segments(curve):
+    for part in mcc.campaign.find_segments(curve):
         rows = slice(part.start, part.stop + 1)
         ax.plot(curve.time_s[rows], curve.force_mN[rows], color=COLOURS.get(part.kind, GREY), lw=2.5)
     for kind, colour in COLOURS.items():
@@ -179,7 +179,7 @@ def priors():
 def model():
     """Draws from the prior, and a test."""
     campaign = mcc.paper_campaign(seed=0)
-    tests = mcc.select_tests(campaign)
+    tests = mcc.calibrate.select_tests(campaign)
     drawn = Predictive(mcc.Model(), num_samples=40)(jax.random.key(0), tests.unobserved())
     first, force = np.asarray(drawn["displacement_um"])[:, 0], np.asarray(tests.record.force)[0]
     used = np.isfinite(first).all(axis=0) & (force > 0)

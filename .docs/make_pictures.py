@@ -19,7 +19,7 @@ import numpy as np
 
 import mcc_jax as mcc
 from mcc_jax._format import plain
-from mcc_jax.discover import discover
+from mcc_jax.discovery import discover
 from mcc_jax.effects import find_variant
 from mcc_jax.report.pictures import draw_enlarged, draw_left_over
 from mcc_jax.report.story import most_informative_test
@@ -55,7 +55,7 @@ def posterior():
     """Posterior of the shape parameter and C3 from twenty tests, which determine a combination better than each."""
     draws = mcc.sample(mcc.paper_campaign(seed=0, instrument=NOISE)).named_population()
     a, C3 = draws["a"].ravel(), np.exp(draws["mu_C3"].ravel())
-    true_C3 = float(np.exp(mcc.paper_population().C3.mean))
+    true_C3 = float(np.exp(mcc.simulate.paper_population().C3.mean))
     figure, ax = panel("A posterior", "shape parameter a [-]", "C3 of the median particle [-]")
     ax.plot(a, C3, ".", ms=2.5, mew=0, color=BLUE, alpha=0.5)
     ax.plot([], [], ".", ms=8, mew=0, color=BLUE, label="draws")  # in the legend larger, or nobody sees them

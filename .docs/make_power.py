@@ -3,7 +3,7 @@
     uv run python .docs/make_power.py
 
 Writes `power.json` next to this file, in about six minutes. It is stored because the pages must build in two. Each plan
-is simulated with the paper's twenty particles and an instrument of stated noise; `mcc_jax.discover.power_of_campaign`
+is simulated with the paper's twenty particles and an instrument of stated noise; `mcc_jax.discovery.power_of_campaign`
 calculates the detection limits. A test in `tests/docs/test_gallery.py` computes one plan again.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 
 import mcc_jax as mcc
 from mcc_jax.campaign import join_campaigns
-from mcc_jax.discover import power_of_campaign
+from mcc_jax.discovery import power_of_campaign
 
 FILE = Path(__file__).parent / "power.json"
 NOISE = {"displacement_noise_um": 0.05, "force_noise_mN": 0.05}

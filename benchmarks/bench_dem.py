@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax import MccLaw, Particle, paper_law, paper_population
+from mcc_jax import MccLaw, Particle, paper_law
 from mcc_jax.dem import (
     HalfContact,
     Interaction,
@@ -43,6 +43,7 @@ from mcc_jax.dem import (
     stable_time_step,
     start,
 )
+from mcc_jax.simulate import paper_population
 
 SKIN = 2e-5
 SPEED = 1.0  # of the punch [m/s]

@@ -27,15 +27,15 @@ import jax
 import numpy as np
 
 import mcc_jax as mcc
-from mcc_jax.discover.base import Base, base_fit
-from mcc_jax.discover.candidates import Candidate, candidates_of, located
-from mcc_jax.discover.columns import with_amplitudes
-from mcc_jax.discover.design import design_of
-from mcc_jax.discover.evidence import LinearModel, visible
-from mcc_jax.discover.misfit import coordinates, scaled
-from mcc_jax.discover.misfit_form import misfit_columns
-from mcc_jax.discover.screen import signature_columns
-from mcc_jax.discover.settings import DECISIONS
+from mcc_jax.discovery.base import Base, base_fit
+from mcc_jax.discovery.candidates import Candidate, candidates_of, located
+from mcc_jax.discovery.columns import with_amplitudes
+from mcc_jax.discovery.design import design_of
+from mcc_jax.discovery.evidence import LinearModel, visible
+from mcc_jax.discovery.misfit import coordinates, scaled
+from mcc_jax.discovery.misfit_form import misfit_columns
+from mcc_jax.discovery.screen import signature_columns
+from mcc_jax.discovery.settings import DECISIONS
 from mcc_jax.effects import LIBRARY, Variant
 
 RESULT = Path(__file__).parent / "results" / "formulas.md"

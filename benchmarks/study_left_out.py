@@ -24,10 +24,10 @@ from scipy.stats import beta
 from study_formulas import at_their_middle, campaign, gram
 
 import mcc_jax as mcc
-from mcc_jax.discover import discover
-from mcc_jax.discover.base import base_fit
-from mcc_jax.discover.candidates import located
-from mcc_jax.discover.screen import signature_columns
+from mcc_jax.discovery import discover
+from mcc_jax.discovery.base import base_fit
+from mcc_jax.discovery.candidates import located
+from mcc_jax.discovery.screen import signature_columns
 from mcc_jax.effects import LIBRARY, Variant
 
 RESULTS = Path(__file__).parent / "results"

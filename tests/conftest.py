@@ -53,7 +53,7 @@ def _keep_everything():
 
 
 GROUPS = {
-    "discover": ("tests/discover/", "tests/cli/test_discover"),
+    "discover": ("tests/discovery/", "tests/cli/test_discover"),
     "posterior": (
         *("tests/calibrate/test_posterior", "tests/calibrate/test_arviz_functions", "tests/calibrate/test_importance"),
         *("tests/plots/test_joint_figures", "tests/plots/test_figures", "tests/test_repr", "tests/test_saved_results"),

@@ -35,7 +35,7 @@ LAYERS = {
     "simulate": 7,
     "calibrate": 8,
     "dem": 9,
-    "discover": 10,
+    "discovery": 10,
     "export": 11,
     "plots": 11,
     "report": 12,

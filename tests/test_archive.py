@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from mcc_jax import InputError, load, paper_law
 from mcc_jax._archive import encode, read_archive
-from mcc_jax.discover import Discovery
+from mcc_jax.discovery import Discovery
 from mcc_jax.effects import AbstractEffect
 from mcc_jax.law import Unloading
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import mcc_jax as mcc
-from mcc_jax import dem, discover, effects, export
+from mcc_jax import dem, discovery, effects, export
 from mcc_jax._format import described, in_words
 
-PARTS = ("law", "campaign", "effects", "simulate", "calibrate", "discover", "dem", "export", "plots", "report")
+PARTS = ("law", "campaign", "effects", "simulate", "calibrate", "discovery", "dem", "export", "plots", "report")
 MOST_LINES, WIDEST = 20, 240
 ABSTRACT = ("AbstractContactLaw", "AbstractEffect", "AbstractModulusAtPeak", "Calibration")
 # What a person does not want to see: whole arrays, types in place of values, addresses.
@@ -46,7 +46,7 @@ def check(thing):
 def test_every_public_class_has_a_repr_of_its_own(name):
     """Not the one that prints arrays in full, nor the one that prints types in place of values."""
     thing = classes()[name]
-    if thing.__name__ in ABSTRACT or issubclass(thing, enum.Enum | Exception) or thing is mcc.RESULTS:
+    if thing.__name__ in ABSTRACT or issubclass(thing, enum.Enum | Exception) or thing is mcc.simulate.RESULTS:
         return
     own = thing.__repr__.__module__ if hasattr(thing.__repr__, "__module__") else ""
     plain = {f.type for f in dataclasses.fields(thing)} if dataclasses.is_dataclass(thing) else {None}
@@ -68,7 +68,7 @@ def some():
         "law with effects": law.with_effects("creep:logarithmic", "frame_compliance"),
         "particle": particle,
         "particles": jax.vmap(mcc.Particle)(*jnp.full((3, 5), 100.0)),
-        "population": mcc.paper_population(),
+        "population": mcc.simulate.paper_population(),
         "response": response,
         "energy": law.energy(particle, response.state, path[-1]),
         "library": mcc.LIBRARY,
@@ -80,14 +80,14 @@ def some():
         "campaign": tests,
         "curve": tests.curves[0],
         "metadata": tests.metadata,
-        "segment": mcc.find_segments(tests.curves[0])[0],
+        "segment": mcc.campaign.find_segments(tests.curves[0])[0],
         "adjustment": mcc.adjust(tests),
-        "tests": mcc.select_tests(tests),
+        "tests": mcc.calibrate.select_tests(tests),
         "record": effects.clean_record(jnp.linspace(0, 10, 20), jnp.linspace(0, 10, 20)),
         "model": mcc.Model().with_effects("creep", "frame_compliance"),
         "priors": mcc.Priors(),
-        "decisions": discover.DECISIONS,
-        "plan": mcc.Plan("a plan", [mcc.Programme.cycles()]),
+        "decisions": discovery.DECISIONS,
+        "plan": mcc.discovery.Plan("a plan", [mcc.Programme.cycles()]),
         "side": side,
         "packing": packing,
         "walls": dem.die(1e-3, 2e-3)[-1],
@@ -111,7 +111,7 @@ def test_calibrations_and_what_they_return_are_told_in_a_few_lines(paper_posteri
     squares = mcc.least_squares(posterior.campaign)
     paper = mcc.calibrate_paper(posterior.campaign)
     parts = [posterior.fit, squares.identifiability, paper.shape, paper.plastic, paper.elastic, paper.adjustment]
-    parts += [mcc.sample_laws(posterior, count=3), *posterior.curves[:1]]
+    parts += [mcc.calibrate.sample_laws(posterior, count=3), *posterior.curves[:1]]
     for thing in (posterior, squares, paper, curves, *parts):
         check(thing)
 

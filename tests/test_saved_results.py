@@ -7,7 +7,7 @@ import pytest
 import mcc_jax as mcc
 from mcc_jax import InputError
 from mcc_jax._archive import encode
-from mcc_jax.discover import Discovery
+from mcc_jax.discovery import Discovery
 from mcc_jax.export import read_calibration, write_export
 from mcc_jax.report import read_results, report_page
 from mcc_jax.simulate import read_effect
@@ -104,7 +104,7 @@ def test_an_empty_folder_is_one_line(tmp_path):
 
 @pytest.mark.extended
 def test_a_discovery_comes_back_with_its_law(tmp_path):
-    from mcc_jax.discover import discover
+    from mcc_jax.discovery import discover
     from mcc_jax.effects import LIBRARY
 
     programme = mcc.Programme.cycles(levels=(0.5, 1.0), hold_s=30.0)

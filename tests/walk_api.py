@@ -17,7 +17,7 @@ import pandas as pd
 
 jax.config.update("jax_enable_x64", True)
 import mcc_jax as mcc  # noqa: E402
-from mcc_jax import calibrate, campaign, dem, discover, effects, export, simulate  # noqa: E402
+from mcc_jax import calibrate, campaign, dem, effects, export, simulate  # noqa: E402
 
 
 def outcome(call, *args, **kwargs) -> str:
@@ -67,7 +67,7 @@ def examples(folder: Path) -> dict[str, Example]:
     return {
         "Particle": Example(mcc.Particle, D1=150.0, D2=130.0, D3=120.0),
         "Plastic": Example(mcc.Plastic, C1=7.0, C3=27.0, C5=140.0, signed=("C3",)),
-        "LogNormal": Example(mcc.LogNormal, mean=2.0, sd=0.3, signed=("mean",)),
+        "LogNormal": Example(mcc.law.LogNormal, mean=2.0, sd=0.3, signed=("mean",)),
         "MccLaw": Example(
             mcc.MccLaw,
             plastic=mcc.Plastic(7.0, 27.0, 140.0),
@@ -80,7 +80,7 @@ def examples(folder: Path) -> dict[str, Example]:
         "paper_law": Example(mcc.paper_law, unloading="printed", strain_scaling="raw"),
         "drive": Example(mcc.drive, law=the_law, particle=particle, path=path, control="displacement"),
         "simulate_batch": Example(
-            mcc.simulate_batch,
+            mcc.simulate.simulate_batch,
             laws=laws,
             particles=campaign.particle_batch(sizes),
             paths=np.stack([path] * 3),
@@ -111,18 +111,18 @@ def examples(folder: Path) -> dict[str, Example]:
             mcc.Curve, time_s=curve.time_s, force_mN=curve.force_mN, displacement_um=curve.displacement_um
         ),
         "Campaign": Example(mcc.Campaign, particles=["a"], diameters_um=np.full((1, 3), 100.0), curves=[curve]),
-        "Metadata": Example(mcc.Metadata, control="load", force_resolution_mN=0.1, punch_diameter_um=500.0),
-        "Segment": Example(mcc.Segment, kind="load", start=0, stop=4),
-        "find_segments": Example(mcc.find_segments, curve=tests.curves[0], control="load"),
+        "Metadata": Example(mcc.campaign.Metadata, control="load", force_resolution_mN=0.1, punch_diameter_um=500.0),
+        "Segment": Example(mcc.campaign.Segment, kind="load", start=0, stop=4),
+        "find_segments": Example(mcc.campaign.find_segments, curve=tests.curves[0], control="load"),
         "adjust": Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
         "strain_table": Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
         "fit_shape_parameter": Example(calibrate.fit_shape_parameter, table=table, objective="full"),
         "Model": Example(
             mcc.Model, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False
         ),
-        "LogNormalPrior": Example(mcc.LogNormalPrior, median=6.0, log_sd=0.5),
-        "NormalPrior": Example(mcc.NormalPrior, mean=1.0, sd=1.0, signed=("mean",)),
-        "NakagamiPrior": Example(mcc.NakagamiPrior, sd=0.3, shape=0.5),
+        "LogNormalPrior": Example(mcc.calibrate.LogNormalPrior, median=6.0, log_sd=0.5),
+        "NormalPrior": Example(mcc.calibrate.NormalPrior, mean=1.0, sd=1.0, signed=("mean",)),
+        "NakagamiPrior": Example(mcc.calibrate.NakagamiPrior, sd=0.3, shape=0.5),
         "calibrate_paper": Example(
             mcc.calibrate_paper,
             campaign=tests,
@@ -151,18 +151,18 @@ def examples(folder: Path) -> dict[str, Example]:
             mcc.calibrate_many, campaigns=[tests], method="least_squares", threshold_MPa=0.2, run=False
         ),
         "discover": Example(
-            discover.discover, campaign=tests, exclude=[], threshold_MPa=0.2, confirm=True, seed=0, run=False
+            mcc.discover, campaign=tests, exclude=[], threshold_MPa=0.2, confirm=True, seed=0, run=False
         ),
         "law_for_each": Example(
-            mcc.law_for_each,
-            plastic=mcc.paper_population().sample(jax.random.key(0), 3),
+            mcc.simulate.law_for_each,
+            plastic=mcc.simulate.paper_population().sample(jax.random.key(0), 3),
             a=1.4,
             effective_modulus_MPa=1e4,
             unloading="printed",
             strain_scaling="raw",
             signed=("a",),
         ),
-        "plastic_shape_factor": Example(mcc.plastic_shape_factor, particle=particle, a=1.4, signed=("a",)),
+        "plastic_shape_factor": Example(mcc.geometry.plastic_shape_factor, particle=particle, a=1.4, signed=("a",)),
         "spheres": Example(dem.spheres, law=the_law, diameter=np.array([1e-4, 1.2e-4]), density=1540.0),
         "die": Example(dem.die, radius=1e-3, height=2e-3),
         "scattered": Example(

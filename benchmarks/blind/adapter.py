@@ -37,13 +37,13 @@ def confirmed(folder: Path, *, seed: int = 0) -> dict[str, Any]:
 
 
 def in_process(folder: Path, *, seed: int = 0, **options: Any) -> dict[str, Any]:
-    """`mcc_jax.discover.discover` in this process: campaigns share what is compiled."""
+    """`mcc_jax.discovery.discover` in this process: campaigns share what is compiled."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from mcc_jax.campaign import read_campaign
 
-    discover = importlib.import_module("mcc_jax.discover").discover
+    discover = importlib.import_module("mcc_jax.discovery").discover
     wanted = {"seed": seed, "experiments": False, **options}
     offered = inspect.signature(discover).parameters
     found = discover(read_campaign(folder), **{name: value for name, value in wanted.items() if name in offered})

@@ -39,7 +39,7 @@ def judge(outcome: Outcome, formulas: dict[str, list[str]], evidence: Evidence) 
     """The kind of one wrong verdict; `formulas` are the library's by mechanism."""
     if outcome.verdict not in ("NO_GAP", "NAMED", "SET"):
         return {"kind": "not compared", "verdict": outcome.verdict}
-    from mcc_jax.discover.settings import DECISIONS
+    from mcc_jax.discovery.settings import DECISIONS
 
     named = outcome.found["effects"]
     winner = evidence([f"{e['mechanism']}:{e['variant']}" for e in named])

@@ -84,7 +84,7 @@ def demo(out: Path, seed: int) -> None:
     say(sentence, fg="green" if agrees else "red", bold=True)
     say(f"  (The seal is the SHA-256 of {SEALED}: sha256sum {shlex.quote(str(out / SEALED))})")
     say()
-    from ..discover.sentences import headline
+    from ..discovery.sentences import headline
 
     right = nothing["verdict"] == "NO_GAP"
     say(f"The same with nothing hidden: {headline(nothing)}", nl=False)
@@ -113,7 +113,7 @@ def _job(
     """Simulate, calibrate, discover, report; the contents of the two results."""
     from ..calibrate import sample
     from ..campaign import write_campaign
-    from ..discover import discover
+    from ..discovery import discover
     from ..report import read_results, report_page
 
     tell("simulating the campaign")
@@ -147,7 +147,7 @@ def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
     """Print what the law alone said, where it fails, the name, and what adding it did."""
     from ..calibrate.summary import quantities
     from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
-    from ..discover.sentences import headline
+    from ..discovery.sentences import headline
 
     say_state(calibration)
     say_warnings(calibration)
@@ -222,7 +222,7 @@ def sealed_answer(seed: int) -> Sealed:
 def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
     """Whether a discovery (discovery.json) named what was hidden (sealed.json), and in a sentence how both agree."""
     from .._format import plain
-    from ..discover.sentences import verdict_in_words
+    from ..discovery.sentences import verdict_in_words
 
     hidden = answer["mechanism"]
     named = [effect["mechanism"] for effect in found["effects"]]

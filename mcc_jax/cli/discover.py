@@ -29,7 +29,7 @@ from .session import (
 )
 
 if TYPE_CHECKING:
-    from ..discover import Discovery
+    from ..discovery import Discovery
 
 DISCOVERY, POWER = "discovery.json", "power.json"
 ROWS = 6
@@ -83,7 +83,7 @@ def discover(
       mcc-jax discover my-tests --out found --exclude thermal_drift --unloading punch
     """
     with session(20) as tell:
-        from ..discover import discover as find
+        from ..discovery import discover as find
 
         require_mechanisms(options["exclude"])
         data = read_without(campaign, options["leave_out"], tell)
@@ -142,7 +142,7 @@ def say_discovery(content: dict[str, Any]) -> None:
     """Print verdict, summary, notes, and the head of the ranking."""
     import textwrap
 
-    from ..discover.sentences import verdict_in_words
+    from ..discovery.sentences import verdict_in_words
 
     say(f"Verdict: {verdict_in_words(content)}", bold=True)
     for line in textwrap.wrap(content["summary"], 100, break_on_hyphens=False):
@@ -191,7 +191,7 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
       mcc-jax power planned --out planned
     """
     with session(20) as tell:
-        from ..discover import power_of_campaign
+        from ..discovery import power_of_campaign
         from ..effects import LIBRARY
 
         require_mechanisms(options["exclude"])

@@ -180,7 +180,7 @@ class Mechanism:
         variants: its formulas, the most common first.
         equivalences: what no data of this kind can distinguish from it; to be declared, never discovered.
         check: what would show it by itself, in addition to what more tests of the same kind would show.
-        coordinates: names of what its formulas depend on, and may be wrong in (`mcc_jax.discover.misfit`).
+        coordinates: names of what its formulas depend on, and may be wrong in (`mcc_jax.discovery.misfit`).
         opposite: the mechanism that is this one with the other sign: the two are no pair.
         sudden: whether it is a step that may be at any point of a test, to be looked for at each.
     """

@@ -20,7 +20,7 @@ from ..calibrate import (
 from ..calibrate.curves import FittedCurve
 from ..calibrate.paper.prediction import ParticleFit
 from ..campaign import PAPER_DIAMETERS_UM, Curve, effective_diameter_um
-from ..discover import Discovery
+from ..discovery import Discovery
 from ..effects.record import HOLD, RELOAD, UNLOAD
 from ..geometry import Particle
 from . import style

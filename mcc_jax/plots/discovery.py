@@ -15,9 +15,9 @@ from matplotlib.patches import Patch
 
 from .._errors import InputError
 from .._format import plain
-from ..discover import Discovery
-from ..discover.locate import Place
-from ..discover.settings import DETECTABLE
+from ..discovery import Discovery
+from ..discovery.locate import Place
+from ..discovery.settings import DETECTABLE
 from . import style
 from .curves import plot_bands, plot_before_after
 from .posterior import plot_prior_posterior

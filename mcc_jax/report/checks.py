@@ -13,7 +13,7 @@ from ..calibrate.curves import FittedCurve
 from ..calibrate.settings import JUDGEMENT, SAMPLING
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from ..discover.sentences import headline, verdict_in_words, within_noise
+from ..discovery.sentences import headline, verdict_in_words, within_noise
 from .read import CALIBRATION, DATA, Results
 from .sentences import beside_the_law
 

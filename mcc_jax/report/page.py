@@ -17,7 +17,7 @@ from ..calibrate.curves import KINDS, FittedCurve
 from ..calibrate.summary import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
-from ..discover.sentences import verdict_in_words
+from ..discovery.sentences import verdict_in_words
 from .read import Results
 
 with extra("report"):

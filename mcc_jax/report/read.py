@@ -16,7 +16,7 @@ from .._errors import InputError
 from .._format import described
 from ..calibrate.results import ARCHIVE, CONTENT, DISCOVERY_ARCHIVE, Calibration, PosteriorDraws, read_saved
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
-from ..discover import Discovery
+from ..discovery import Discovery
 from ..files import RESULT_BYTES, read_regular
 
 CALIBRATION, DISCOVERY, CAMPAIGN = CONTENT, "discovery.json", "campaign"

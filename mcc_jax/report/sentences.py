@@ -6,7 +6,7 @@ import shlex
 from typing import Any
 
 from .._format import interval, listed, number, percent, plain, probability
-from ..discover.settings import ENOUGH
+from ..discovery.settings import ENOUGH
 from ..plots.style import is_simulated
 from .read import Results
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from .._format import listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import FittedCurve
-from ..discover import Discovery
-from ..discover.sentences import headline
+from ..discovery import Discovery
+from ..discovery.sentences import headline
 from ..plots.style import is_simulated
 from .pictures import Example, example_pictures
 from .read import Results

@@ -1,5 +1,6 @@
 """From law and programme to curves: one particle, many particles, whole campaigns."""
 
+from .._results import RESULTS as RESULTS
 from .campaign import PAPER_PEAK_STRESS_MPA as PAPER_PEAK_STRESS_MPA
 from .campaign import law_for_each as law_for_each
 from .campaign import paper_campaign as paper_campaign

@@ -130,7 +130,7 @@ def simulate_campaign(
             (`RESULTS` says why).
     """
     if jnp.ndim(laws.plastic.C1) != 1:
-        raise InputError("laws has no leading axis", remedy="Make one law for each with mcc_jax.law_for_each.")
+        raise InputError("laws has no leading axis", remedy="Make one law for each with mcc_jax.simulate.law_for_each.")
     instrument = Instrument() if instrument is None else instrument
     seed = arguments.seed(seed)
     effects = hidden_effects(effects)

@@ -198,7 +198,7 @@ def _check_count(count: int, **batches: Any) -> None:
         for leaf in jax.tree.leaves(batch):
             if eqx.is_array(leaf) and jnp.shape(leaf)[:1] != (count,):
                 has = f"{leaf.shape[0]} entries" if leaf.ndim else "no leading axis"
-                remedy = "Make a batch with equinox.filter_vmap, for instance mcc_jax.law_for_each."
+                remedy = "Make a batch with equinox.filter_vmap, for instance mcc_jax.simulate.law_for_each."
                 raise InputError(f"there are {count} paths and {name} with {has}: they must be as many", remedy=remedy)
 
 

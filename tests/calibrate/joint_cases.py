@@ -4,15 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax import (
-    Instrument,
-    Plastic,
-    Programme,
-    StrainScaling,
-    Unloading,
-    law_for_each,
-    simulate_campaign,
-)
+from mcc_jax import Instrument, Plastic, Programme, Unloading, simulate_campaign
 from mcc_jax.calibrate.data import Tests, select_tests
 from mcc_jax.calibrate.forward import Linear
 from mcc_jax.calibrate.marginal import Marginal
@@ -21,6 +13,8 @@ from mcc_jax.calibrate.population import Population
 from mcc_jax.calibrate.straightening import Straight
 from mcc_jax.campaign import particle_batch
 from mcc_jax.effects import Record
+from mcc_jax.law import StrainScaling
+from mcc_jax.simulate import law_for_each
 
 A, EBAR = 1.43, 16_000.0
 NOISE = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, simulated, true_latent
 
-from mcc_jax import Instrument, StrainScaling, Unloading
+from mcc_jax import Instrument, Unloading
 from mcc_jax.calibrate import Model, select_tests
 from mcc_jax.calibrate.fitting import ALONE, _centre
 from mcc_jax.calibrate.forward import Forms, residuals, snap
 from mcc_jax.calibrate.particle_fit import fit_particles, linear_starts
+from mcc_jax.law import StrainScaling
 
 pytestmark = pytest.mark.extended
 

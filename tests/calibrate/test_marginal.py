@@ -21,13 +21,14 @@ from joint_cases import (
 from scipy.special import roots_hermitenorm
 from scipy.stats import multivariate_normal
 
-from mcc_jax import Model, StrainScaling
+from mcc_jax import Model
 from mcc_jax.calibrate.forward import Point
 from mcc_jax.calibrate.marginal import Marginal, summarise
 from mcc_jax.calibrate.noise import Along, Correlation, Noise
 from mcc_jax.calibrate.population import Scatter, moments
 from mcc_jax.calibrate.straightening import Straight
 from mcc_jax.campaign import particle_batch
+from mcc_jax.law import StrainScaling
 
 FLAT = np.array([0.15, 0.45, -0.1])
 PLAIN = Model().scatter

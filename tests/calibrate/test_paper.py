@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from helpers import TESTERS
 
-from mcc_jax import (
-    InputError,
-    Instrument,
-    Programme,
-    Ramp,
-    calibrate_paper,
-    paper_campaign,
-    read_tester_file,
-)
+from mcc_jax import InputError, Instrument, Programme, Ramp, calibrate_paper, paper_campaign
 from mcc_jax.calibrate import sharding
+from mcc_jax.campaign import read_tester_file
 
 
 @pytest.fixture(scope="module")

@@ -7,16 +7,8 @@ import numpy as np
 import pytest
 from joint_cases import NOISE, Programme, flatness, simulated, true_coefficients
 
-from mcc_jax import (
-    compare_with_paper,
-    paper_campaign,
-    predict_measured,
-    predict_new_particle,
-    sample,
-    sample_laws,
-    to_arviz,
-    write_posterior,
-)
+from mcc_jax import paper_campaign, predict_measured, predict_new_particle, sample
+from mcc_jax.calibrate import compare_with_paper, sample_laws, to_arviz, write_posterior
 from mcc_jax.calibrate.importance import ordered_resample, pareto_k, smoothed_weights
 
 

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from mcc_jax import InputError, Model, Priors, Unloading, read_priors
-from mcc_jax.calibrate import LogNormalPrior, NakagamiPrior, NormalPrior
+from mcc_jax import InputError, Model, Priors, Unloading
+from mcc_jax.calibrate import LogNormalPrior, NakagamiPrior, NormalPrior, read_priors
 
 
 @pytest.fixture

@@ -9,7 +9,8 @@ import pytest
 from joint_cases import NOISE
 from numpyro.infer.util import log_density
 
-from mcc_jax import InputError, Model, compare, least_squares, log_evidence, paper_campaign, sample, select_tests
+from mcc_jax import InputError, Model, compare, least_squares, log_evidence, paper_campaign, sample
+from mcc_jax.calibrate import select_tests
 from mcc_jax.calibrate.noise import standard_promotion, student_weights
 
 SPIKED, SPIKE_UM = 0.05, 0.5

@@ -8,12 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from mcc_jax import Instrument, LogNormal, Plastic, Programme, paper_campaign, paper_law
+from mcc_jax import Instrument, Plastic, Programme, paper_campaign, paper_law
 from mcc_jax.calibrate import fit_shape_parameter, strain_table
 from mcc_jax.calibrate.paper.loading import MasterCurve, StrainTable, fit_polynomial, fit_population, master_curve
 from mcc_jax.calibrate.paper.modulus import campaign_branches, fit_effective_modulus
 from mcc_jax.calibrate.paper.shape import _weights, choose_reference, full_objective, objective_at, reference_objective
 from mcc_jax.campaign import adjust, find_segments, loading_curve
+from mcc_jax.law import LogNormal
 
 
 @pytest.fixture(scope="module")

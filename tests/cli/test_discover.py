@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
 from mcc_jax.cli.main import cli
-from mcc_jax.discover.sentences import verdict_in_words
+from mcc_jax.discovery.sentences import verdict_in_words
 from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended

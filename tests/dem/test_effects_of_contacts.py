@@ -10,7 +10,7 @@ import pytest
 from test_pair_law import ON_PATH, PARTICLE, UM, WALL_PATH, cycle, driven, law_of
 
 from benchmarks import energy_paths
-from mcc_jax import InputError, Particle, StrainScaling, Unloading, drive
+from mcc_jax import InputError, Particle, Unloading, drive
 from mcc_jax.dem import (
     half_contact,
     load_state,
@@ -24,6 +24,7 @@ from mcc_jax.dem import (
     wall_force,
 )
 from mcc_jax.effects import LIBRARY, AbstractEffect, AbstractModulusAtPeak, find_variant
+from mcc_jax.law import StrainScaling
 
 CLOSED = [v for m in ("damage", "densification_stiffening", "size_effect", "shape_second_order") for v in LIBRARY[m]]
 CLOSED = [v for v in CLOSED if v.name not in ("cyclic", "locking", "locking_exponential")]

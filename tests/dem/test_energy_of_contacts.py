@@ -8,7 +8,7 @@ import pytest
 from helpers import ALL_FORMS
 
 from benchmarks import energy_paths
-from mcc_jax import MccLaw, Plastic, StrainScaling, Unloading
+from mcc_jax import MccLaw, Plastic, Unloading
 from mcc_jax.dem import (
     Motion,
     Plane,
@@ -22,6 +22,7 @@ from mcc_jax.dem import (
     wall_recovery,
 )
 from mcc_jax.geometry import Particle
+from mcc_jax.law import StrainScaling
 
 ROUNDING = 1e-13
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from packed import CAPACITY, DIE_RADIUS, PRESSING, SKIN, dense, forces_of, loose, motion, packing, squeezed
 
-from mcc_jax import InputError, MccLaw, Plastic, paper_law, paper_population
+from mcc_jax import InputError, MccLaw, Plastic, paper_law
 from mcc_jax.dem import (
     Cylinder,
     Interaction,
@@ -31,6 +31,7 @@ from mcc_jax.dem import (
     start,
     step,
 )
+from mcc_jax.simulate import paper_population
 
 REST = np.zeros((3, 3))
 STEP = jax.jit(step)

@@ -12,16 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from two_scalars import bisected_path
 
-from mcc_jax import (
-    InputError,
-    MccLaw,
-    Particle,
-    Plastic,
-    StrainScaling,
-    Unloading,
-    paper_law,
-    paper_population,
-)
+from mcc_jax import InputError, MccLaw, Particle, Plastic, Unloading, paper_law
 from mcc_jax.dem import (
     HalfContact,
     half_contact,
@@ -32,6 +23,8 @@ from mcc_jax.dem import (
     wall_energy,
     wall_force,
 )
+from mcc_jax.law import StrainScaling
+from mcc_jax.simulate import paper_population
 
 UM, MN = 1e-6, 1e-3
 FORMS = [(u, s) for u in Unloading for s in (StrainScaling.RAW, StrainScaling.MASTER)]

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, signature_rows
 
-from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, find_segments, paper_campaign
-from mcc_jax.campaign import available_data, humidities, record_batch, record_of
+from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, paper_campaign
+from mcc_jax.campaign import available_data, find_segments, humidities, record_batch, record_of
 from mcc_jax.campaign.record import ramp_rates
 from mcc_jax.effects import Need, clean_record
 

@@ -11,8 +11,9 @@ from bisecting import pair_force
 from compiling import LANGUAGES, PAIR, PLATES, WALL, build_driver, compile_with, head, run_driver
 from helpers import FORMS
 
-from mcc_jax import History, InputError, MccLaw, Particle, Plastic, StrainScaling, Unloading, paper_law
+from mcc_jax import InputError, MccLaw, Particle, Plastic, Unloading, paper_law
 from mcc_jax.export import Origin, c_header
+from mcc_jax.law import History, StrainScaling
 
 MODULUS_MPA = {Unloading.PRINTED: 16000.0, Unloading.PUNCH: 500.0, Unloading.PUNCH_EXACT: 500.0}
 PARTICLE = Particle(213.54, 196.07, 186.33)

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import pytest
 from calibrations import write
 
-from mcc_jax import InputError, Particle, StrainScaling, Unloading, paper_law
+from mcc_jax import InputError, Particle, Unloading, paper_law
 from mcc_jax.export import card, read_calibration
+from mcc_jax.law import StrainScaling
 
 PARTICLE = Particle(213.54, 196.07, 186.33)
 

@@ -16,7 +16,7 @@ from test_c_header import history, random_laws, random_paths, scales
 from test_recipes import run_recipe
 from test_tables import assert_rebuilt
 
-from mcc_jax import InputError, Particle, StrainScaling, Unloading, drive, paper_law
+from mcc_jax import InputError, Particle, Unloading, drive, paper_law
 from mcc_jax.dem import half_contact, pair_force, wall_force
 from mcc_jax.effects import LIBRARY, AbstractEffect, AbstractModulusAtPeak
 from mcc_jax.export import (
@@ -29,6 +29,7 @@ from mcc_jax.export import (
     write_export,
     yade_recipe,
 )
+from mcc_jax.law import StrainScaling
 
 pytestmark = pytest.mark.extended
 

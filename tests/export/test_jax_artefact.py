@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import InputError, Particle, StrainScaling, Unloading, paper_law
+from mcc_jax import InputError, Particle, Unloading, paper_law
 from mcc_jax.export import golden_table, jax_artefact, write_export
+from mcc_jax.law import StrainScaling
 
 pytestmark = pytest.mark.extended
 

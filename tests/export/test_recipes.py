@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from compiling import HERE, compile_with
 
-from mcc_jax import Particle, StrainScaling, Unloading, paper_law
+from mcc_jax import Particle, Unloading, paper_law
 from mcc_jax.export import Origin, c_header, lammps_recipe, yade_recipe
+from mcc_jax.law import StrainScaling
 
 PARTICLE = Particle(213.54, 196.07, 186.33)
 FORMS = [(Unloading.PRINTED, StrainScaling.RAW), (Unloading.PUNCH_EXACT, StrainScaling.MASTER)]

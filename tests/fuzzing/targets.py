@@ -161,7 +161,7 @@ SAVED = "discovery.msgpack"
 
 def saved_discovery() -> bytes:
     from mcc_jax._archive import encode
-    from mcc_jax.discover import Discovery
+    from mcc_jax.discovery import Discovery
 
     return encode(Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 2.0))
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from helpers import close, paper_law, paper_particle
 
-from mcc_jax import InputError, MccLaw, drive, simulate_batch
+from mcc_jax import InputError, MccLaw, drive
 from mcc_jax.effects import LIBRARY, AbstractEffect, Need, Variant
 from mcc_jax.geometry import Particle
 from mcc_jax.law import Plastic
+from mcc_jax.simulate import simulate_batch
 
 LAW, PARTICLE = paper_law(), paper_particle(3)
 COMPLIANCE, RATE, TAU = 0.0015, 0.01, 10.0

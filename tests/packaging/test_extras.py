@@ -96,7 +96,7 @@ def _report(_):
 
 
 def _write(folder):
-    return mcc.write_posterior(object.__new__(mcc.Posterior), folder / "posterior.nc")
+    return mcc.calibrate.write_posterior(object.__new__(mcc.Posterior), folder / "posterior.nc")
 
 
 CALLS = {
@@ -166,7 +166,7 @@ def test_figures_and_report_each_name_their_own_extra():
 @pytest.mark.extended
 def test_every_public_name_of_the_library_comes_without_any_extra():
     """All but figures and report, whose modules say what they need."""
-    parts = ("law", "campaign", "effects", "simulate", "calibrate", "discover", "dem", "export")
+    parts = ("law", "campaign", "effects", "simulate", "calibrate", "discovery", "dem", "export")
     done = run(
         f"import importlib, mcc_jax\nfrom mcc_jax import *\nfor p in {parts!r}: importlib.import_module('mcc_jax.' + p)"
     )

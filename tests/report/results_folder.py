@@ -12,7 +12,7 @@ import numpy as np
 from mcc_jax.calibrate.data import rows_from_contact
 from mcc_jax.calibrate.results import Calibration, PosteriorDraws, read_saved
 from mcc_jax.campaign import Campaign, campaign_segments, file_checksums, write_campaign
-from mcc_jax.discover import Discovery
+from mcc_jax.discovery import Discovery
 from mcc_jax.effects import find_variant
 from mcc_jax.law import MccLaw, Plastic
 from mcc_jax.simulate import Hold, Programme, Ramp, simulate_campaign

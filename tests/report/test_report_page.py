@@ -17,8 +17,8 @@ from results_folder import C as COEFFICIENTS
 
 from mcc_jax._format import interval, number, with_sd
 from mcc_jax.calibrate.curves import KINDS
-from mcc_jax.discover import Discovery
-from mcc_jax.discover.sentences import headline
+from mcc_jax.discovery import Discovery
+from mcc_jax.discovery.sentences import headline
 from mcc_jax.report import read_results, report_page
 from mcc_jax.report.chart import chart_data, chart_items, compare
 from mcc_jax.report.checks import check_results, share_inside

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import RESULTS, MccLaw, Particle, Plastic, drive, paper_law, paper_population, simulate_batch
+from mcc_jax import MccLaw, Particle, Plastic, drive, paper_law
+from mcc_jax.simulate import RESULTS, paper_population, simulate_batch
 
 PARTICLE = Particle(213.54, 196.07, 186.33)
 

@@ -12,24 +12,11 @@ from helpers import between
 from hypothesis import given, settings
 
 from benchmarks import energy_paths
-from mcc_jax import (
-    RESULTS,
-    InputError,
-    MccLaw,
-    Particle,
-    Plastic,
-    Programme,
-    StrainScaling,
-    Unloading,
-    drive,
-    law_for_each,
-    simulate_batch,
-    simulate_campaign,
-)
+from mcc_jax import InputError, MccLaw, Particle, Plastic, Programme, Unloading, drive, simulate_campaign
 from mcc_jax.dem import half_contact
 from mcc_jax.effects import LIBRARY, find_variant
-from mcc_jax.law import TESTED_STRAIN
-from mcc_jax.simulate import HiddenEffect
+from mcc_jax.law import TESTED_STRAIN, StrainScaling
+from mcc_jax.simulate import RESULTS, HiddenEffect, law_for_each, simulate_batch
 
 AT_PEAK = [v for m in ("damage", "densification_stiffening") for v in LIBRARY[m] if v.name != "cyclic"]
 AT_PEAK.sort(key=lambda v: v.name not in ("square", "stress"))  # what gains most is what a quick run takes

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import HiddenEffect, Instrument, Programme, drive, paper_campaign, paper_law, simulate_batch
+from mcc_jax import HiddenEffect, Instrument, Programme, drive, paper_campaign, paper_law
 from mcc_jax.campaign import particle_batch
 from mcc_jax.effects import LIBRARY
 from mcc_jax.geometry import Particle
-from mcc_jax.simulate import read_effect
+from mcc_jax.simulate import read_effect, simulate_batch
 
 PROGRAMME = Programme.cycles(levels=(0.5, 1.0), unload_to=0.1, hold_s=20.0, points=80)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from campaigns import cached
 
-from mcc_jax.discover import discover
+from mcc_jax.discovery import discover
 from mcc_jax.effects import LIBRARY
 from mcc_jax.plots import discovery_figures, plot_before_after, plot_gap, plot_ranking, save_figures
 

@@ -8,7 +8,7 @@ import pytest
 from campaigns import SINGLE, cached, campaign, with_curves
 
 from mcc_jax import InputError
-from mcc_jax.discover import discover
+from mcc_jax.discovery import discover
 from mcc_jax.effects import EQUIVALENCES, LIBRARY
 
 QUICK = {"confirm": False, "experiments": False, "posterior": False}

@@ -6,14 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from mcc_jax.discover.answer import _averaged
-from mcc_jax.discover.closure import LETTERS, terms_of
-from mcc_jax.discover.discover import _taken_back
-from mcc_jax.discover.heldout import HeldOut
-from mcc_jax.discover.hypothesis import UNLISTED
-from mcc_jax.discover.result import Discovery, Effect
-from mcc_jax.discover.sentences import summary_of
-from mcc_jax.discover.settings import DECISIONS, Decisions
+from mcc_jax.discovery.answer import _averaged
+from mcc_jax.discovery.closure import LETTERS, terms_of
+from mcc_jax.discovery.discover import _taken_back
+from mcc_jax.discovery.heldout import HeldOut
+from mcc_jax.discovery.hypothesis import UNLISTED
+from mcc_jax.discovery.result import Discovery, Effect
+from mcc_jax.discovery.sentences import summary_of
+from mcc_jax.discovery.settings import DECISIONS, Decisions
 from mcc_jax.effects import find_variant
 
 EST = {"value": 16_000.0, "sd": 100.0, "interval_95": [15_800.0, 16_200.0]}
@@ -136,11 +136,3 @@ def test_few_numbers_decide():
     text = Decisions.__doc__ or ""
     assert all(field.name in text for field in dataclasses.fields(Decisions))
     assert Decisions() == DECISIONS
-
-
-def test_the_package_may_be_called_as_its_function():
-    import mcc_jax as mcc
-    from mcc_jax.discover import discover
-
-    assert callable(mcc.discover)
-    assert mcc.discover.__call__ is discover

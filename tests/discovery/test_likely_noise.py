@@ -5,7 +5,7 @@ import pytest
 from campaigns import base_of, cached, with_curves
 
 from mcc_jax.calibrate.noise import Along, Correlation
-from mcc_jax.discover.likely_noise import with_likely_noise
+from mcc_jax.discovery.likely_noise import with_likely_noise
 
 pytestmark = pytest.mark.extended
 

@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal, norm
 
 from mcc_jax import Model, log_evidence
 from mcc_jax.calibrate.distributions import SCALES, nuisance_moments
-from mcc_jax.discover.design import ExtraColumns, between, design_of, moved
-from mcc_jax.discover.evidence import (
+from mcc_jax.discovery.design import ExtraColumns, between, design_of, moved
+from mcc_jax.discovery.evidence import (
     LinearModel,
     amplitudes,
     log_joint,
@@ -22,8 +22,8 @@ from mcc_jax.discover.evidence import (
     value_and_gradient,
     whitened,
 )
-from mcc_jax.discover.fit import fit_hypothesis
-from mcc_jax.discover.settings import POPULATION
+from mcc_jax.discovery.fit import fit_hypothesis
+from mcc_jax.discovery.settings import POPULATION
 from mcc_jax.effects import find_variant
 
 pytestmark = pytest.mark.extended

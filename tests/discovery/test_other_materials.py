@@ -5,10 +5,10 @@ import pytest
 
 from mcc_jax.calibrate import Model
 from mcc_jax.campaign import Campaign, Curve, campaign_findings, check_tests
-from mcc_jax.discover import discover
-from mcc_jax.discover.base import base_fit
-from mcc_jax.discover.misfit import informative
-from mcc_jax.discover.settings import DECISIONS
+from mcc_jax.discovery import discover
+from mcc_jax.discovery.base import base_fit
+from mcc_jax.discovery.misfit import informative
+from mcc_jax.discovery.settings import DECISIONS
 
 pytestmark = pytest.mark.extended
 

@@ -8,7 +8,7 @@ from campaigns import SINGLE, cached, campaign, mixed, subset, with_curves
 from helpers import TESTERS
 
 from mcc_jax.campaign import read_tester_file
-from mcc_jax.discover import discover
+from mcc_jax.discovery import discover
 from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended

@@ -7,15 +7,15 @@ import pytest
 from campaigns import base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
-from mcc_jax.discover import screen
-from mcc_jax.discover.answer import _population, effects_of, instead_of, name_probabilities, sets_of
-from mcc_jax.discover.bootstrap import p_anything
-from mcc_jax.discover.candidates import untestable
-from mcc_jax.discover.evidence import LinearModel, likely_start, optimise
-from mcc_jax.discover.hypothesis import UNLISTED, Hypothesis
-from mcc_jax.discover.locate import difference, places, where
-from mcc_jax.discover.search import Search
-from mcc_jax.discover.settings import DECISIONS, VERY_STRONG
+from mcc_jax.discovery import screen
+from mcc_jax.discovery.answer import _population, effects_of, instead_of, name_probabilities, sets_of
+from mcc_jax.discovery.bootstrap import p_anything
+from mcc_jax.discovery.candidates import untestable
+from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
+from mcc_jax.discovery.hypothesis import UNLISTED, Hypothesis
+from mcc_jax.discovery.locate import difference, places, where
+from mcc_jax.discovery.search import Search
+from mcc_jax.discovery.settings import DECISIONS, VERY_STRONG
 from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended
@@ -49,7 +49,7 @@ def test_a_hidden_effect_leads_and_its_probability_says_so(named):
 
 def test_p_values_of_nothing_are_uniform(nothing, monkeypatch):
     """Scores drawn from the null law itself in place of the observed ones."""
-    from mcc_jax.discover import bootstrap
+    from mcc_jax.discovery import bootstrap
 
     plain = bootstrap._Statistic
     rng = np.random.default_rng(0)
@@ -198,7 +198,7 @@ def test_pairs_to_first_order_are_of_two_mechanisms(named, monkeypatch):
     best = int(np.argmax(value))
     assert alone.max() - 8 < value[best] < alone.max() + 8
     assert named.leading_pairs() == {}
-    monkeypatch.setattr("mcc_jax.discover.search.DECISIONS", replace(DECISIONS, margin=-100.0))
+    monkeypatch.setattr("mcc_jax.discovery.search.DECISIONS", replace(DECISIONS, margin=-100.0))
     assert named.leading_pairs() == {("damage", "frame_compliance"): (a[best], b[best])}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mcc_jax.calibrate import Model
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign, Curve
-from mcc_jax.discover.base import base_fit
+from mcc_jax.discovery.base import base_fit
 from mcc_jax.simulate import (
     Instrument,
     Programme,

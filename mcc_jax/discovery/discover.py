@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from types import ModuleType
 from typing import Any
 
 from .. import arguments
@@ -355,12 +353,3 @@ def _finished(found: Discovery, findings: Sequence[Finding], started: float) -> 
     found = replace(found, findings=tuple(findings), notes=(*map(str, findings), *found.notes))
     summary = found.summary or summary_of(found)
     return replace(found, summary=summary, runtime_s=time.perf_counter() - started)
-
-
-class _Package(ModuleType):
-    """The package, which may be called as its function is: `mcc_jax.discover(campaign, model)`."""
-
-    __call__ = staticmethod(discover)
-
-
-sys.modules[__name__.rpartition(".")[0]].__class__ = _Package
