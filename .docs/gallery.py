@@ -197,7 +197,7 @@ def _signed(value):
 # ---- the gallery -----------------------------------------------------------------------------------------------------
 
 CAUSES = {
-    "tester": "Of the instrument",
+    "instrument": "Of the instrument",
     "contact": "Where particle and platen meet",
     "loading": "Of loading",
     "unloading": "Of unloading",

@@ -1,8 +1,8 @@
 """What the two textbook hierarchical calibrations share: data, law, priors' constants, time budget and summary.
 
 Model: stress on load and unload is normal about the printed law with one noise, log C1, log C3 and log C5 of each
-particle are normal about a population, the shape parameter and the effective modulus are common to all. The tester's
-zero is taken as known and the largest strain so far as measured, so that the law is explicit in displacement.
+particle are normal about a population, the shape parameter and the effective modulus are common to all. The zero of the
+instrument is taken as known and the largest strain so far as measured, so that the law is explicit in displacement.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def data_from_campaign(campaign: Campaign, *, points: int = 180, zero_um: np.nda
     Args:
         campaign: the tests, simulated, so that their zero is known.
         points: the most points to keep of one particle, evenly spread over those that qualify.
-        zero_um: the tester's zero of each particle [um], which is subtracted; `paper_campaign` has 0.
+        zero_um: the instrument's zero of each particle [um], which is subtracted; `paper_campaign` has 0.
     """
     rows = []
     zeros = np.broadcast_to(zero_um, len(campaign))

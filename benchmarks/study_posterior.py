@@ -1,7 +1,7 @@
 """Is the posterior's uncertainty honest? Simulation-based calibration of the posterior.
 
 For every campaign the truth is drawn from the prior (population, effects, particles, peak stresses), the tests are
-simulated as a tester would record them, and the posterior is sampled. If everything is right, the true value's rank
+simulated as an instrument would record them, and the posterior is sampled. If all is right, the true value's rank
 among posterior draws is uniform (Talts et al. 2018), and intervals cover as often as they say. Settings:
 
 - prior: 20 particles with the sizes of the paper's Table 1, everything drawn from priors around the paper's values;

@@ -1,4 +1,4 @@
-"""Simulated campaigns, and what testers do to them: an offset, a clipped channel, breakage, a stuck logger."""
+"""Simulated campaigns, and what instruments do to them: an offset, a clipped channel, breakage, a stuck logger."""
 
 import functools
 from dataclasses import replace

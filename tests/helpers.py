@@ -18,17 +18,17 @@ from mcc_jax.law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainSca
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
-class _TesterFiles:
-    """Files of real testers, which are not the project's own: a test that asks for one is skipped where it is not."""
+class _InstrumentFiles:
+    """Files of real instruments, which are not the project's own: a test that needs one that is absent is skipped."""
 
     def __truediv__(self, name):
         file = SHARED / "data" / "testers" / name
         if not file.exists():
-            pytest.skip("needs the tester files beside the checkout")
+            pytest.skip("needs the instrument files beside the checkout")
         return file
 
 
-TESTERS = _TesterFiles()
+INSTRUMENTS = _InstrumentFiles()
 K1, K3, K5, A, EBAR = 7.0094, 27.235, 144.23, 1.43, 16000.0
 FORMS = [(u, s) for u in Unloading for s in StrainScaling]
 FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]

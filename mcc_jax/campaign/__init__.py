@@ -27,7 +27,7 @@ from .plausibility import other_material as other_material
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
 from .readers import read_diameters as read_diameters
-from .readers import read_tester_file as read_tester_file
+from .readers import read_instrument_file as read_instrument_file
 from .record import available_data as available_data
 from .record import humidities as humidities
 from .record import record_batch as record_batch

@@ -84,7 +84,7 @@ def convert(
             check_tests,
             find_segments,
             read_diameters,
-            read_tester_file,
+            read_instrument_file,
             write_campaign,
         )
 
@@ -92,7 +92,7 @@ def convert(
         sizes = None if diameters is None else read_diameters(diameters)
         given = [*mapping, *([] if diameters is None else [Path(diameters)])]
         skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
-        campaign = read_tester_file(file, diameters_um=sizes, mapping=mapping or None, skip=skip)
+        campaign = read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=skip)
         tell("finding the segments")
         segments = [Counter(part.kind for part in find_segments(curve)) for curve in campaign.curves]
         tell("writing")

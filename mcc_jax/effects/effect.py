@@ -63,7 +63,7 @@ class AbstractEffect(eqx.Module):
         return self.label or type(self).__name__
 
     @property
-    def of_tester(self) -> bool:
+    def of_instrument(self) -> bool:
         """Whether it belongs to what lies between particle and read-out, not to the particle."""
         return self.overrides("observe")
 

@@ -6,14 +6,14 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
 from .._errors import InputError
-from . import contact, creep, cycles, loading, material, tester, unloading
+from . import contact, creep, cycles, instrument, loading, material, unloading
 from .variant import Mechanism, Variant
 
 _ALL = (
-    tester.FRAME, tester.DRIFT, creep.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE, material.DENSIFICATION,
-    cycles.HYSTERESIS, cycles.RATCHETING, loading.HARDENING, unloading.SHAPE_OF_UNLOADING, material.SIZE,
-    material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION, contact.MISALIGNMENT, tester.SINK_IN,
-    unloading.REVERSAL, material.HUMIDITY,
+    instrument.FRAME, instrument.DRIFT, creep.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE,
+    material.DENSIFICATION, cycles.HYSTERESIS, cycles.RATCHETING, loading.HARDENING, unloading.SHAPE_OF_UNLOADING,
+    material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION, contact.MISALIGNMENT,
+    instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
 )  # fmt: skip
 
 

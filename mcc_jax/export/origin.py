@@ -140,7 +140,7 @@ def read_calibration(
         entry = None if particle is None else entry_of(content, particle)
         sizes, geometry = _sizes(found, path, particle, diameters)
         law = found.law(particle)
-        observed = [effect.name for effect in law.effects if effect.of_tester]
+        observed = [effect.name for effect in law.effects if effect.of_instrument]
         law = law.of_particle()
         notes = check(law, sizes, allow_not_monotone=allow_not_monotone)
     except InputError as error:
@@ -148,7 +148,7 @@ def read_calibration(
             raise
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
     if observed:
-        notes = (*notes, f"{', '.join(observed)} belong to the tester, not to the particle, and are left out")
+        notes = (*notes, f"{', '.join(observed)} belong to the instrument, not to the particle, and are left out")
     return law, sizes, _origin(content, entry, law, file, particle, geometry, notes)
 
 

@@ -160,7 +160,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
 
     def of_particle(self) -> MccLaw:
         """The law without what belongs to the instrument (frame, drift, platens)."""
-        return self._with(tuple(effect for effect in self.effects if not effect.of_tester))
+        return self._with(tuple(effect for effect in self.effects if not effect.of_instrument))
 
     def without_effects(self, *names: str) -> MccLaw:
         """The law without the effects of these names, as `effect.name` gives them; without names, without any."""

@@ -1,4 +1,4 @@
-"""How a law with effects moves: parameters, loading, modulus, then what is added inside the law and by the tester."""
+"""Response of a law with effects: parameters, loading, modulus, then what is added in the law and by the instrument."""
 
 from __future__ import annotations
 
@@ -217,8 +217,8 @@ def folded(
     for effect in effects:
         other = effect.overrides("stiffness") and not isinstance(effect, AbstractModulusAtPeak)
         if not effect.closed or other or effect.overrides("loading", "inside", "observe"):
-            leave = "of_particle() leaves out what belongs to the tester"
-            leave = leave if effect.of_tester else f'without_effects("{effect.name}") leaves it out'
+            leave = "of_particle() leaves out what belongs to the instrument"
+            leave = leave if effect.of_instrument else f'without_effects("{effect.name}") leaves it out'
             raise InputError(
                 f"{what} of a law with {effect.name} is not known in closed form",
                 remedy=f"law.{leave}; mcc_jax.drive and the JAX artefact (export --format jax) take every effect.",

@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from helpers import TESTERS
+from helpers import INSTRUMENTS
 
 from mcc_jax import InputError, Instrument, Programme, Ramp, calibrate_paper, paper_campaign
 from mcc_jax.calibrate import sharding
-from mcc_jax.campaign import read_tester_file
+from mcc_jax.campaign import read_instrument_file
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_the_offset_step_biases_the_shape_parameter_low():
 
 @pytest.mark.extended
 def test_indentation_of_another_material_runs_and_is_called_badly_described():
-    campaign = read_tester_file(TESTERS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0))
+    campaign = read_instrument_file(INSTRUMENTS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0))
     result = calibrate_paper(campaign, threshold_MPa=0.2)
     content = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert len(content["particles"]) == 10

@@ -1,4 +1,4 @@
-"""A folder of testers' files as one campaign, and Excel workbooks among them."""
+"""A folder of instruments' files as one campaign, and Excel workbooks among them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
-from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_tester_file, write_campaign
+from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_instrument_file, write_campaign
 from mcc_jax.campaign.readers.folder import natural, passed_over
 
 MAPPING = """
@@ -44,7 +44,7 @@ def folder_of(tmp_path, files: dict[str, str | bytes]):
 def read(folder, keys: str = "", **settings) -> Campaign:
     mapping = folder.parent / "m.toml"
     mapping.write_text(keys + MAPPING if "[columns]" not in keys else keys)
-    return read_tester_file(folder, mapping=mapping, **{"diameters_um": SIZES} | settings)
+    return read_instrument_file(folder, mapping=mapping, **{"diameters_um": SIZES} | settings)
 
 
 def told(folder, *args, **settings) -> str:
@@ -175,14 +175,14 @@ def test_diameters_of_the_files_and_of_a_table(tmp_path):
     assert found == [pytest.approx([100] * 3), pytest.approx([200] * 3), SIZES]
 
 
-def test_folders_that_are_none_of_testers(tmp_path):
+def test_folders_that_are_none_of_instruments(tmp_path):
     folder = folder_of(tmp_path, TESTS)
     assert "one of the folders in it: Série 7" in told(_nested(tmp_path))
     write_campaign(read(folder), tmp_path / "out")
     assert "is a campaign already" in told(tmp_path / "out")
     assert "test_name" in told(folder, 'test_name = "A"\n')
     with pytest.raises(InputError, match="nothing to skip"):
-        read_tester_file(folder / "P9.txt", mapping=tmp_path / "m.toml", diameters_um=SIZES, skip=["x"])
+        read_instrument_file(folder / "P9.txt", mapping=tmp_path / "m.toml", diameters_um=SIZES, skip=["x"])
 
 
 def _nested(tmp_path):
@@ -228,7 +228,7 @@ def fischer(count: int) -> str:
 )
 def test_a_folder_of_each_known_format(tmp_path, content, peak, form):
     folder = folder_of(tmp_path, {f"{i}.dat": content.encode("latin-1") + b"\r\n" * i for i in (2, 10, 1)})
-    campaign = read_tester_file(folder, diameters_um={"1": SIZES, "2.dat": SIZES, "10": SIZES})
+    campaign = read_instrument_file(folder, diameters_um={"1": SIZES, "2.dat": SIZES, "10": SIZES})
     assert campaign.particles == ("1", "2", "10")
     assert [curve.force_mN.max() for curve in campaign.curves] == [pytest.approx(peak)] * 3
     assert form in (campaign.metadata.provenance or "")
@@ -241,13 +241,13 @@ def test_archives_and_many_tests_in_a_file(tmp_path):
     with zipfile.ZipFile(folder / "a.zip", "w") as archive:
         for name in ("x.txt", "y.txt"):
             archive.writestr(name, MICRO)
-    campaign = read_tester_file(folder, diameters_um=SIZES)
+    campaign = read_instrument_file(folder, diameters_um=SIZES)
     assert campaign.particles == ("a-x", "a-y", "b-1", "b-2", "b-3")
     assert campaign.metadata.control is None
     hld = HLD + "\r\n"
     (folder / "c.hld").write_bytes(hld.replace("Machine", "FB Mode: Displacement Control\r\nMachine").encode())
     with pytest.raises(InputError, match=r"controlled by displacement, that of b\.txt by load"):
-        read_tester_file(folder, diameters_um=SIZES)
+        read_instrument_file(folder, diameters_um=SIZES)
 
 
 # ---- Excel workbooks -------------------------------------------------------------------------------------------------
@@ -295,13 +295,13 @@ test = { column = "Probe" }
 header = "Gage length"
 """
     (tmp_path / "m.toml").write_text(mapping, encoding="utf-8")
-    campaign = read_tester_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml")
+    campaign = read_instrument_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml")
     assert campaign.particles == ("1",)
     assert campaign.diameters_um.tolist() == [[250, 250, 250]]
     assert campaign.curves[0].force_mN.tolist() == [0, 125, 250, 500]
     assert findings(campaign) == ["1 row with a missing reading was dropped, in 1 test"]
     (tmp_path / "m.toml").write_text(mapping.replace('"Daten 1"', "2"), encoding="utf-8")
-    assert len(read_tester_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml").curves[0]) == 4
+    assert len(read_instrument_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml").curves[0]) == 4
 
 
 @settings(max_examples=40, deadline=None)
@@ -317,7 +317,7 @@ def test_numbers_of_a_workbook_are_exact(tmp_path_factory, numbers, decimal, shi
     rows = [[None] * shift + [i, *pair] for i, pair in enumerate(numbers)]
     write_book(folder / "x.xlsx", {"A": [[None] * shift + HEAD, *rows]})
     (folder / "m.toml").write_text(f'decimal_mark = "{decimal}"\ndelimiter = ";"\n' + MAPPING)
-    curve = read_tester_file(folder / "x.xlsx", mapping=folder / "m.toml", diameters_um=SIZES).curves[0]
+    curve = read_instrument_file(folder / "x.xlsx", mapping=folder / "m.toml", diameters_um=SIZES).curves[0]
     assert list(zip(curve.force_mN.tolist(), curve.displacement_um.tolist(), strict=True)) == numbers
 
 
@@ -340,7 +340,7 @@ def book_told(tmp_path, keys: str, sheets, mapping: bool = True) -> str:
     write_book(tmp_path / "x.xlsx", sheets)
     (tmp_path / "m.toml").write_text(keys + MAPPING)
     with pytest.raises(InputError) as caught:
-        read_tester_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml" if mapping else None, diameters_um=SIZES)
+        read_instrument_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml" if mapping else None, diameters_um=SIZES)
     return str(caught.value)
 
 
@@ -356,7 +356,7 @@ def test_workbooks_that_do_not_fit(tmp_path):
     (tmp_path / "t.txt").write_text(text_of(1))
     (tmp_path / "m.toml").write_text("sheet = 1\n" + MAPPING)
     with pytest.raises(InputError, match="no Excel workbook"):
-        read_tester_file(tmp_path / "t.txt", mapping=tmp_path / "m.toml", diameters_um=SIZES)
+        read_instrument_file(tmp_path / "t.txt", mapping=tmp_path / "m.toml", diameters_um=SIZES)
 
 
 def test_without_the_package_for_workbooks(tmp_path, monkeypatch):
@@ -375,7 +375,7 @@ def test_damaged_workbooks_never_crash(tmp_path_factory, at, byte, cut):
     (folder / "x.xlsx").write_bytes(bytes(data[:place] if cut and place else data))
     (folder / "m.toml").write_text(MAPPING)
     try:
-        campaign = read_tester_file(folder / "x.xlsx", mapping=folder / "m.toml", diameters_um=SIZES)
+        campaign = read_instrument_file(folder / "x.xlsx", mapping=folder / "m.toml", diameters_um=SIZES)
     except InputError:
         return
     assert len(campaign) == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mcc_jax._errors import InputError
-from mcc_jax.campaign import read_tester_file
+from mcc_jax.campaign import read_instrument_file
 
 MAPPING = """
 [columns.time]
@@ -25,7 +25,7 @@ TABLE = "Time (s),Load,Depth\n0,0,0\n1,0.001,500\n2,0.002,1000\n"
 def convert(tmp_path, table: str | bytes = TABLE, mapping: str = MAPPING, **kwargs):
     (tmp_path / "t.dat").write_bytes(table.encode() if isinstance(table, str) else table)
     (tmp_path / "m.toml").write_text(mapping, encoding="utf-8")
-    return read_tester_file(tmp_path / "t.dat", mapping=tmp_path / "m.toml", **kwargs)
+    return read_instrument_file(tmp_path / "t.dat", mapping=tmp_path / "m.toml", **kwargs)
 
 
 def message(*args, **kwargs) -> str:
@@ -114,7 +114,7 @@ def test_quotes_and_names(tmp_path):
 
 
 def test_fischer_through_a_mapping_equals_its_reader(tmp_path):
-    from helpers import TESTERS
+    from helpers import INSTRUMENTS
     from test_readers import lines_of
 
     rows = "\n".join(lines_of("FS1.txt")[84:1285])
@@ -127,7 +127,7 @@ columns.force = { column = "F", unit = "mN" }
 columns.displacement = { column = "h", unit = "um" }
 """
     mapped = convert(tmp_path, rows.encode("latin-1"), mapping, diameters_um=[1.0, 1.0, 1.0]).curves[0]
-    known = read_tester_file(TESTERS / "FS1.txt", diameters_um=[1.0, 1.0, 1.0]).curves[0]
+    known = read_instrument_file(INSTRUMENTS / "FS1.txt", diameters_um=[1.0, 1.0, 1.0]).curves[0]
     assert np.array_equal(mapped.force_mN, known.force_mN)
     assert np.array_equal(mapped.time_s, known.time_s)
     assert np.array_equal(mapped.displacement_um, known.displacement_um)
@@ -248,4 +248,4 @@ def test_bad_table(tmp_path, case):
 def test_missing_mapping(tmp_path):
     (tmp_path / "t.dat").write_text(TABLE)
     with pytest.raises(InputError, match="no such file"):
-        read_tester_file(tmp_path / "t.dat", mapping=tmp_path / "m.toml")
+        read_instrument_file(tmp_path / "t.dat", mapping=tmp_path / "m.toml")

@@ -9,7 +9,7 @@ from test_csv import make
 from test_valid_files import COLUMNS, convert, table, told
 
 from mcc_jax._errors import InputError
-from mcc_jax.campaign import read_campaign, read_diameters, read_tester_file
+from mcc_jax.campaign import read_campaign, read_diameters, read_instrument_file
 
 HEAD, CURVE = "particle,D1_um,D2_um,D3_um\n", "particle,time_s,force_mN,displacement_um\nA,0,0,0\nA,1,2,1\n"
 SPACED = COLUMNS.replace('{ column = "t", unit = "s" }', '{ interval = 0.5, unit = "s" }')
@@ -160,7 +160,9 @@ def test_a_table_may_write_a_files_ending_in_small_or_capital_letters(tmp_path):
     for ending in ("txt", "TXT"):
         sizes.write_text(f"file,D1_um,D2_um,D3_um\ne.{ending},1,2,3\n")
         convert(tmp_path, table())
-        found = read_tester_file(tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=read_diameters(sizes))
+        found = read_instrument_file(
+            tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=read_diameters(sizes)
+        )
         assert found.diameters_um.tolist() == [[1, 2, 3]]
 
 
@@ -176,7 +178,7 @@ def two_kinds(folder, first="", second=GERMAN, german="t;F;d\n0;0;0\n1;2,5;0,5\n
     mappings = [folder / "first.toml", folder / "second.toml"]
     for file, keys in zip(mappings, (first, second), strict=True):
         file.write_text(keys + COLUMNS)
-    return read_tester_file(folder / "in", mapping=mappings, diameters_um=[3.0, 2.0, 1.0])
+    return read_instrument_file(folder / "in", mapping=mappings, diameters_um=[3.0, 2.0, 1.0])
 
 
 def test_each_file_of_a_folder_is_read_by_the_mapping_that_fits(tmp_path):

@@ -18,11 +18,11 @@ from mcc_jax.campaign import (
     Curve,
     check_plausibility,
     read_campaign,
-    read_tester_file,
+    read_instrument_file,
 )
 from mcc_jax.simulate import Instrument, Programme, paper_campaign
 
-PEBBLES, TESTERS = SHARED / "data" / "pebbles", SHARED / "data" / "testers"
+PEBBLES, INSTRUMENTS = SHARED / "data" / "pebbles", SHARED / "data" / "testers"
 
 
 def campaign(diameters, curves):
@@ -286,7 +286,7 @@ def test_a_diameter_in_the_place_of_d3(order, swapped):
     assert [finding.sentence[:39] for finding in findings] == [f"The diameters {swapped} seem to be swap"]
 
 
-def test_some_tests_of_another_tester_are_listed():
+def test_some_tests_of_another_instrument_are_listed():
     good, wrong = cellulose(1), slip(cellulose(1), force=1e3)
     mixed = replace(good, curves=(*wrong.curves[:8], *good.curves[8:]))
     (finding,) = check_plausibility(mixed)
@@ -433,10 +433,10 @@ def test_measured_pebbles_are_not_accused_and_their_slips_are_named(folder):
         assert says(check_plausibility(slip(tests, **SLIPS[kind][0])), kind)
 
 
-@pytest.mark.skipif(not TESTERS.is_dir(), reason="needs the measured indentations beside the checkout")
+@pytest.mark.skipif(not INSTRUMENTS.is_dir(), reason="needs the measured indentations beside the checkout")
 @pytest.mark.parametrize("name", ["Exp-50mN_0000.hld", "FS1.txt", "RobinSteel0000LC.txt", "multipleIndentations.zip"])
 def test_indentations_with_a_made_up_diameter_are_not_accused(name):
-    read = read_tester_file(TESTERS / name, diameters_um=(200.0, 190.0, 180.0))
+    read = read_instrument_file(INSTRUMENTS / name, diameters_um=(200.0, 190.0, 180.0))
     for size in ((200.0, 190.0, 180.0), (50.0, 50.0, 50.0), (100.0, 100.0, 100.0), (500.0, 500.0, 500.0)):
         tests = replace(read, diameters_um=np.tile(size, (len(read), 1)))
         assert not accusing(check_plausibility(tests))

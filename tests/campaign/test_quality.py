@@ -1,4 +1,4 @@
-"""What testers do to tests is found, corrected where the record allows, and told; honest tests stay as they are."""
+"""What instruments do to tests is found, corrected where the record allows, and told; honest tests stay as they are."""
 
 from dataclasses import replace
 

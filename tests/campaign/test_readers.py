@@ -7,12 +7,12 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers import TESTERS
+from helpers import INSTRUMENTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
-from mcc_jax.campaign import read_campaign, read_diameters, read_tester_file, write_campaign
+from mcc_jax.campaign import read_campaign, read_diameters, read_instrument_file, write_campaign
 from mcc_jax.campaign.readers import micromaterials
 
 FILES = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
@@ -20,7 +20,7 @@ SIZES = [200.0, 190.0, 180.0]
 
 
 def read(path, **kwargs):
-    return read_tester_file(path, **{"diameters_um": SIZES} | kwargs)
+    return read_instrument_file(path, **{"diameters_um": SIZES} | kwargs)
 
 
 def message(path, **kwargs) -> str:
@@ -33,7 +33,7 @@ def message(path, **kwargs) -> str:
 
 
 def test_fischer():
-    campaign = read(TESTERS / "FS1.txt")
+    campaign = read(INSTRUMENTS / "FS1.txt")
     assert campaign.particles == tuple(str(i) for i in range(1, 11))
     assert campaign.diameters_um.shape == (10, 3)
     assert campaign.metadata.control == "load"
@@ -45,11 +45,11 @@ def test_fischer():
     for curve in campaign.curves:
         assert curve.force_mN.max() == pytest.approx(300, abs=0.01)
     assert "R = 10% 8 Cycles" in campaign.metadata.other["test_parameters"]
-    assert "Compliance\t[µm/N]\t      1.9" in campaign.metadata.other["tester_results"]["1"]
+    assert "Compliance\t[µm/N]\t      1.9" in campaign.metadata.other["instrument_results"]["1"]
 
 
 def test_hysitron_hld():
-    campaign = read(TESTERS / "Exp-50mN_0000.hld")
+    campaign = read(INSTRUMENTS / "Exp-50mN_0000.hld")
     assert campaign.particles == ("Exp-50mN_0000",)
     curve, other = campaign.curves[0], campaign.metadata.other
     assert len(curve) == 1068
@@ -63,11 +63,11 @@ def test_hysitron_hld():
     assert len(other["approach_block"]["MotorDisp_mm"]) == 312
     assert len(other["drift_block"]["Disp_nm"]) == 913
     assert len(other["test_block_further_columns"]["LoadCell_nm"]) == 1068
-    assert other["tester_header"]["Drift Monitor Time"] == "40 s"
+    assert other["instrument_header"]["Drift Monitor Time"] == "40 s"
 
 
 def test_hysitron_lc():
-    campaign = read(TESTERS / "RobinSteel0000LC.txt")
+    campaign = read(INSTRUMENTS / "RobinSteel0000LC.txt")
     curve, other = campaign.curves[0], campaign.metadata.other
     assert len(curve) == 5304
     assert other["block_lengths"] == [201, 104, 2000, 1000, 1999]
@@ -77,7 +77,7 @@ def test_hysitron_lc():
 
 
 def test_micromaterials():
-    campaign = read(TESTERS / "multipleIndentations.zip")
+    campaign = read(INSTRUMENTS / "multipleIndentations.zip")
     assert len(campaign) == 39
     assert campaign.particles[0] == "1000nmXX 1 6958 -4555"
     assert campaign.metadata.control is None
@@ -87,7 +87,7 @@ def test_micromaterials():
 
 
 def test_single_micromaterials_text(tmp_path):
-    with zipfile.ZipFile(TESTERS / "multipleIndentations.zip") as archive:
+    with zipfile.ZipFile(INSTRUMENTS / "multipleIndentations.zip") as archive:
         name = archive.namelist()[0]
         (tmp_path / "one.dat").write_bytes(archive.read(name))
     assert read(tmp_path / "one.dat").particles == ("one",)
@@ -96,7 +96,7 @@ def test_single_micromaterials_text(tmp_path):
 @pytest.mark.parametrize("name", FILES)
 def test_format_is_told_by_content_and_campaign_survives_files(tmp_path, name):
     disguised = tmp_path / "data.bin"
-    disguised.write_bytes((TESTERS / name).read_bytes())
+    disguised.write_bytes((INSTRUMENTS / name).read_bytes())
     campaign = read(disguised)
     write_campaign(campaign, tmp_path / "c")
     again = read_campaign(tmp_path / "c")
@@ -113,7 +113,7 @@ def test_diameters(tmp_path):
     table = tmp_path / "d.csv"
     table.write_text("particle,D1_mm,D2_um,D3_um\nRobinSteel0000LC,0.2,190,180\n")
     diameters = read_diameters(table)
-    campaign = read(TESTERS / "RobinSteel0000LC.txt", diameters_um=diameters)
+    campaign = read(INSTRUMENTS / "RobinSteel0000LC.txt", diameters_um=diameters)
     assert campaign.diameters_um.tolist() == [SIZES]
     assert read_diameters("200,190, 180") == SIZES
 
@@ -131,7 +131,7 @@ def test_diameters(tmp_path):
     ],
 )
 def test_bad_diameters(diameters, piece):
-    assert piece in message(TESTERS / "RobinSteel0000LC.txt", diameters_um=diameters)
+    assert piece in message(INSTRUMENTS / "RobinSteel0000LC.txt", diameters_um=diameters)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_bad_diameters_on_the_command_line(text):
 
 
 def lines_of(name: str) -> list[str]:
-    return (TESTERS / name).read_bytes().decode("latin-1").split("\n")
+    return (INSTRUMENTS / name).read_bytes().decode("latin-1").split("\n")
 
 
 DAMAGE = {
@@ -302,7 +302,7 @@ def test_missing_file(tmp_path):
 @settings(max_examples=60, deadline=None)
 @given(name=st.sampled_from(FILES), data=st.data())
 def test_broken_bytes_never_crash(tmp_path_factory, name, data):
-    content = bytearray((TESTERS / name).read_bytes())
+    content = bytearray((INSTRUMENTS / name).read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(content) - 1))
         content[at : at + data.draw(st.sampled_from([0, 1, 5, 100_000]))] = data.draw(st.binary(max_size=4))

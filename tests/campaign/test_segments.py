@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers import TESTERS
+from helpers import INSTRUMENTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from protocols import Protocol, make_protocol
 
-from mcc_jax.campaign import Curve, Segment, find_segments, read_tester_file, summarise_segments
+from mcc_jax.campaign import Curve, Segment, find_segments, read_instrument_file, summarise_segments
 
 SIZES = [200.0, 190.0, 180.0]
 
@@ -41,7 +41,7 @@ def assert_found(protocol: Protocol, **options) -> None:
 
 @pytest.mark.parametrize("control", [None, "load"])
 def test_fischer_has_ten_tests_of_eight_cycles(control):
-    campaign = read_tester_file(TESTERS / "FS1.txt", diameters_um=SIZES)
+    campaign = read_instrument_file(INSTRUMENTS / "FS1.txt", diameters_um=SIZES)
     cycle = ["unload", "reload", "load"]
     for curve in campaign.curves:
         segments = find_segments(curve, control=control)
@@ -58,11 +58,11 @@ def test_fischer_has_ten_tests_of_eight_cycles(control):
 
 @pytest.mark.parametrize("control", [None, "load"])
 def test_micromaterials_has_approach_load_hold_unload(control):
-    campaign = read_tester_file(TESTERS / "multipleIndentations.zip", diameters_um=SIZES)
+    campaign = read_instrument_file(INSTRUMENTS / "multipleIndentations.zip", diameters_um=SIZES)
     for curve in campaign.curves:
         approach, load, hold, unload = find_segments(curve, control=control)
         assert kinds((approach, load, hold, unload)) == ["approach", "load", "hold", "unload"]
-        # The tester starts its clock at contact; before, the depth is negative.
+        # The instrument starts its clock at contact; before, the depth is negative.
         contact = int(np.flatnonzero(curve.time_s > 0)[0])
         assert abs(approach.stop - contact) <= 12
         assert abs(curve.displacement_um[approach.stop]) < 0.015
@@ -75,7 +75,7 @@ def test_micromaterials_has_approach_load_hold_unload(control):
 
 
 def test_hysitron_hld_has_no_hold():
-    curve = read_tester_file(TESTERS / "Exp-50mN_0000.hld", diameters_um=SIZES).curves[0]
+    curve = read_instrument_file(INSTRUMENTS / "Exp-50mN_0000.hld", diameters_um=SIZES).curves[0]
     segments = find_segments(curve)
     assert kinds(segments) == ["approach", "load", "unload"]
     # The header programs loading from 4.68 s to 5.68 s.
@@ -84,7 +84,7 @@ def test_hysitron_hld_has_no_hold():
 
 
 def test_hysitron_lc_agrees_with_the_files_own_blocks():
-    campaign = read_tester_file(TESTERS / "RobinSteel0000LC.txt", diameters_um=SIZES)
+    campaign = read_instrument_file(INSTRUMENTS / "RobinSteel0000LC.txt", diameters_um=SIZES)
     segments = find_segments(campaign.curves[0])
     assert kinds(segments) == ["approach", "load", "hold", "unload"]
     blocks = campaign.metadata.other["block_lengths"]

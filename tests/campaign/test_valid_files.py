@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
-from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_tester_file
+from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_instrument_file
 from mcc_jax.campaign.table import parse_number
 
 COLUMNS = """
@@ -33,7 +33,7 @@ def table(head: str = "t,F,d", end: str = "", rows=ROWS, mark: str = ",") -> str
 def convert(folder, text: str | bytes, keys: str = "", columns: str = COLUMNS, sizes=(200.0, 190.0, 180.0)) -> Campaign:
     (folder / "e.txt").write_bytes(text.encode() if isinstance(text, str) else text)
     (folder / "m.toml").write_text(keys + columns, encoding="utf-8")
-    return read_tester_file(
+    return read_instrument_file(
         folder / "e.txt", mapping=folder / "m.toml", diameters_um=None if sizes is None else list(sizes)
     )
 
@@ -381,14 +381,14 @@ def test_one_table_of_particles_for_many_files(tmp_path):
     (tmp_path / "m.toml").write_text(COLUMNS)
     for key in ("e", "e.txt"):
         sizes[key] = sizes.pop("e")
-        campaign = read_tester_file(tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=sizes)
+        campaign = read_instrument_file(tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=sizes)
         assert campaign.diameters_um.tolist() == [[200, 190, 180]]
         (finding,) = campaign.metadata.other["conversion"]["findings"]
         assert finding["sentence"] == "2 rows of the diameters are for no test here and not used"
         sizes["e"] = sizes.pop(key)
     del sizes["e"]
     with pytest.raises(InputError, match="none of the diameters is for a test"):
-        read_tester_file(tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=sizes)
+        read_instrument_file(tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=sizes)
 
 
 SPHERE = COLUMNS + '[diameters]\nheader = "Gage length"\n'

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from asserting import snapshot
-from helpers import TESTERS
+from helpers import INSTRUMENTS
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
 from mcc_jax.cli.demo import NOTHING, SEALED, STRENGTHS, compared, sealed_answer
@@ -220,7 +220,7 @@ def test_calibrate_recovers_what_simulate_put_in(run, tmp_path):
         assert content[f"log_{name}"]["mean"]["value"] == pytest.approx(math.log(value), abs=5e-3)
 
 
-def test_simulate_by_default_is_the_paper_campaign_with_a_perfect_tester(run, tmp_path):
+def test_simulate_by_default_is_the_paper_campaign_with_a_perfect_instrument(run, tmp_path):
     text = done(run("simulate", "--out", tmp_path / "sim", "--seed", "4"))
     assert "20 particles" in text
     mine, papers = read_campaign(tmp_path / "sim"), paper_campaign(4, instrument=Instrument())
@@ -295,7 +295,7 @@ def test_simulate_by_a_programme_file(run, simulated, tmp_path):
 @pytest.mark.extended
 def test_convert_then_calibrate_says_that_the_law_does_not_fit(run, tmp_path):
     tests, fit = tmp_path / "tests", tmp_path / "fit"
-    text = done(run("convert", TESTERS / "FS1.txt", "--out", tests, "--diameters", "200,190,180"))
+    text = done(run("convert", INSTRUMENTS / "FS1.txt", "--out", tests, "--diameters", "200,190,180"))
     campaign = read_campaign(tests)
     counts = Counter(part.kind for curve in campaign.curves for part in find_segments(curve))
     assert "10 tests, 12000 points" in text

@@ -218,11 +218,11 @@ def test_finite_everywhere(peak):
 @pytest.mark.parametrize("variant", OTHERS, ids=named)
 def test_everything_else_is_refused_by_name(variant):
     effect = variant.build(variant.typical)
-    remedy = r"of_particle\(\)" if effect.of_tester else r"without_effects\(\"" + named(variant)
+    remedy = r"of_particle\(\)" if effect.of_instrument else r"without_effects\(\"" + named(variant)
     law = law_of()._with((effect,))
     with pytest.raises(InputError, match=f"half contact of a law with {named(variant)} is not known.*{remedy}"):
         half_contact(law, PARTICLE)
-    rest = law.of_particle() if effect.of_tester else law.without_effects(named(variant))
+    rest = law.of_particle() if effect.of_instrument else law.without_effects(named(variant))
     assert eqx.tree_equal(half_contact(rest, PARTICLE), half_contact(law_of(), PARTICLE))
 
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 from campaigns import SINGLE, cached, campaign, mixed, subset, with_curves
-from helpers import TESTERS
+from helpers import INSTRUMENTS
 
-from mcc_jax.campaign import read_tester_file
+from mcc_jax.campaign import read_instrument_file
 from mcc_jax.discovery import discover
 from mcc_jax.effects import LIBRARY
 
@@ -123,7 +123,7 @@ def test_a_gap_twenty_times_larger_than_any_believable_one():
 @pytest.fixture(scope="module")
 def indentation():
     """Ten indentations of fused silica with a sharp tip: not cellulose, no platens, no particle."""
-    return answer(read_tester_file(TESTERS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0)), confirm=True)
+    return answer(read_instrument_file(INSTRUMENTS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0)), confirm=True)
 
 
 def test_an_indentation_is_not_said_to_agree_with_the_law(indentation):

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.extended
 def hard_spheres(count, toe, seed=0, rows=300):
     """Spheres of 1 mm whose loading curve is of the law's form, a soft contact, and a wander of each one's own.
 
-    The tester drives the displacement at one speed; half of the spheres give way before the record ends.
+    The instrument drives the displacement at one speed; half of the spheres give way before the record ends.
     """
     rng = np.random.default_rng(seed)
     diameters = 1000.0 * rng.uniform(0.95, 1.05, (count, 1)) * np.ones(3)

@@ -1,4 +1,4 @@
-"""Damage to bytes: what disks, editors, spreadsheets, testers and malice do to files."""
+"""Damage to bytes: what disks, editors, spreadsheets, instruments and malice do to files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A catalogue of campaigns that somebody may well bring: each a kind of damage, or of unusual tester, and a seed."""
+"""A catalogue of campaigns that somebody may well bring: each a kind of damage or unusual instrument, and a seed."""
 
 from __future__ import annotations
 

@@ -95,11 +95,11 @@ def convert(name: str, mapping: str | None = None) -> Callable[[Path], None]:
     """What `mcc-jax convert` does: read, write, and what was written must read back the same."""
 
     def read(folder: Path) -> None:
-        from mcc_jax.campaign import read_campaign, read_tester_file, write_campaign
+        from mcc_jax.campaign import read_campaign, read_instrument_file, write_campaign
 
         described = None if mapping is None else folder / mapping
         sizes = None if mapping is not None else [200.0, 190.0, 180.0]
-        campaign = read_tester_file(folder / name, diameters_um=sizes, mapping=described)
+        campaign = read_instrument_file(folder / name, diameters_um=sizes, mapping=described)
         again = folder / "converted"
         try:
             write_campaign(campaign, again)
@@ -150,7 +150,7 @@ def read_state(folder: Path) -> None:
 
 FOLDER, MAPPED, HEADED = samples("campaign"), samples("mapped"), samples("headed")
 ZIP = {"tests.zip": zipped(sample("micromaterials.txt"))}
-TESTERS = (
+INSTRUMENTS = (
     ("Fischer", "fischer.txt"),
     ("Hysitron hld", "hysitron.hld"),
     ("Hysitron text", "hysitron_lc.txt"),
@@ -176,7 +176,7 @@ DISCOVERY = {"discovery.json": sample("results/discovery.json"), SAVED: saved_di
 READERS = (
     *(Reader(name, 4, FOLDER, bytes_of(name), read_campaign) for name in FOLDER),
     Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_diameters),
-    *(Reader(label, 4, {name: sample(name)}, bytes_of(name), convert(name)) for label, name in TESTERS),
+    *(Reader(label, 4, {name: sample(name)}, bytes_of(name), convert(name)) for label, name in INSTRUMENTS),
     Reader("archive", 5, ZIP, bytes_of("tests.zip"), convert("tests.zip")),
     Reader("mapped table", 4, MAPPED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
     Reader("mapping", 4, MAPPED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),

@@ -8,7 +8,7 @@ import pytest
 
 from mcc_jax import InputError
 from mcc_jax.calibrate import read_priors
-from mcc_jax.campaign import read_diameters, read_tester_file
+from mcc_jax.campaign import read_diameters, read_instrument_file
 
 SAMPLES = Path(__file__).parent / "samples"
 SIZES = [200.0, 190.0, 180.0]
@@ -21,7 +21,7 @@ def refused(read, *arguments, **options) -> str:
     return str(caught.value)
 
 
-TESTERS = {
+INSTRUMENTS = {
     "peak with two points": ("fischer.txt", b"HM  0.020000/", b"HM  0.02.000/", None),
     "digits of a count": ("fischer.txt", b"\r\n2\tn\t", b"\r\n" + b"2" * 5000 + b"\tn\t", None),
     "digits of points": ("hysitron.hld", b"Test Data Points: 12", b"Test Data Points: " + b"1" * 5000, "neither"),
@@ -32,24 +32,24 @@ TESTERS = {
 }
 
 
-@pytest.mark.parametrize("case", TESTERS)
-def test_testers_files(tmp_path, case):
-    name, old, new, words = TESTERS[case]
+@pytest.mark.parametrize("case", INSTRUMENTS)
+def test_instruments_files(tmp_path, case):
+    name, old, new, words = INSTRUMENTS[case]
     data = (SAMPLES / name).read_bytes()
     assert old in data
     file = tmp_path / name
     file.write_bytes(data.replace(old, new, 1))
     if words is None:  # what cannot be understood of the header is no reason to refuse whole tests
-        assert len(read_tester_file(file, diameters_um=SIZES)) == 2
+        assert len(read_instrument_file(file, diameters_um=SIZES)) == 2
     else:
-        assert words in refused(read_tester_file, file, diameters_um=SIZES)
+        assert words in refused(read_instrument_file, file, diameters_um=SIZES)
 
 
 def test_many_empty_lines_behind_the_samples(tmp_path):
     """They were taken off one by one, each time with a copy of all others, which took minutes."""
     file = tmp_path / "a.txt"
     file.write_bytes((SAMPLES / "micromaterials.txt").read_bytes() + b"\n" * 300_000)
-    assert len(read_tester_file(file, diameters_um=SIZES).curves[0]) == 12
+    assert len(read_instrument_file(file, diameters_um=SIZES).curves[0]) == 12
 
 
 @pytest.mark.parametrize(

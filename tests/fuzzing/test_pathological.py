@@ -70,7 +70,7 @@ def test_command_ends_in_one_line(name):
 
 
 @pytest.mark.parametrize("name", ["all displacements below zero", "displacement of the other sign"])
-def test_paper_s_method_does_not_need_the_tester_s_zero(name):
+def test_paper_s_method_does_not_need_the_instrument_s_zero(name):
     found = run_one(BY_NAME[name], 1, "paper")
     assert not found.fault, found
 

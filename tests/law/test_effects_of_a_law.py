@@ -1,4 +1,4 @@
-"""A law with effects is a law: by hand, driven, differentiated, by name, without what is the tester's."""
+"""A law with effects is a law: by hand, driven, differentiated, by name, without what is the instrument's."""
 
 import equinox as eqx
 import jax
@@ -90,7 +90,7 @@ def test_batches_and_the_state_that_is_carried_on():
     np.testing.assert_allclose(rest.displacement, whole.displacement[90:], rtol=1e-10)
 
 
-def test_what_belongs_to_the_tester_is_left_out():
+def test_what_belongs_to_the_instrument_is_left_out():
     law = LAW.with_effects("frame_compliance", "thermal_drift", "platen_sink_in", "damage", "size_effect", "creep")
     assert [effect.name.split(":")[0] for effect in law.of_particle().effects] == ["damage", "size_effect", "creep"]
 

@@ -151,7 +151,7 @@ def test_recovery_of_the_twenty(computed):
                 check(value, text, slack=2)
 
 
-def test_displacements_beyond_the_testers_range(computed):
+def test_displacements_beyond_the_instruments_range(computed):
     assert list(np.flatnonzero(computed["gamma_7MPa_um"] > 100) + 1) == [1, 5, 16, 17]
     assert list(np.flatnonzero(computed["gamma_16MPa_um"] > 100) + 1) == [1, 2, 5, 13, 16, 17, 18, 20]
     for number, printed in {

@@ -59,5 +59,5 @@ def read(lines: list[str], file: Path) -> Tests:
     if counts and sum(counts) != len(curves):
         raise cut_off(f"the header announces {sum(counts)} tests, the file holds {len(curves)}", file)
     parameters = [line.strip() for line in lines[: starts[0]] if re.match(r"[FCR] = ", line)]
-    other = {"test_parameters": parameters, "tester_results": results}
+    other = {"test_parameters": parameters, "instrument_results": results}
     return Tests(curves, "Fischer HM export", "load", other)

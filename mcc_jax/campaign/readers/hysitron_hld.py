@@ -97,4 +97,4 @@ def _facts(header: list[tuple[str, str]]) -> dict[str, Any]:
     drift = leading_number(plain.get("Drift Rate", ""))
     if drift is not None and plain["Drift Rate"].endswith("nm/s"):
         other["drift_rate_um_per_s"] = drift / 1e3
-    return other | {"programmed_segments": segments, "tester_header": plain}
+    return other | {"programmed_segments": segments, "instrument_header": plain}

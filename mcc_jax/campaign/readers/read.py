@@ -30,7 +30,7 @@ FORMATS = {
 }
 
 
-def read_tester_file(
+def read_instrument_file(
     path: str | os.PathLike[str],
     *,
     diameters_um: Diameters | None = None,

@@ -1,4 +1,4 @@
-"""What the tester did is told by every command, in the files and on the page; particles can be left out by name."""
+"""What the instrument did is told by every command, in the files and on the page; particles can be left out by name."""
 
 import json
 
