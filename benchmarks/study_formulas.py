@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true")
     jax.config.update("jax_enable_x64", True)
-    base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, tell=lambda _: None)
+    base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, progress=lambda _: None)
     assert base.converged
     assert not base.snapping
     candidates = [c for c in candidates_of(LIBRARY) if not (c.variant.random_per_test or located(c.variant))]

@@ -50,7 +50,7 @@ def answer(variant: Variant, unit: float) -> dict[str, Any]:
 
 def solve(part: int, parts: int, strength: float) -> None:
     """Answer every `parts`-th formula, from the `part`-th on."""
-    base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, tell=lambda _: None)
+    base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, progress=lambda _: None)
     variants = [v for m in LIBRARY.values() for v in m.variants if not (v.random_per_test or located(v))]
     product = gram(base, signature_columns(base, base.state, at_their_middle(variants)))
     sd = np.sqrt(np.diagonal(product))

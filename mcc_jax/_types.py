@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 import jax.numpy as jnp
@@ -17,6 +18,8 @@ Flag: TypeAlias = Bool[Array, ""]
 Path: TypeAlias = Float[Array, " steps"]
 Values: TypeAlias = Float[Array, "..."]
 """One number or many at once, for functions that act on each alone."""
+Progress: TypeAlias = Callable[[str], None]
+"""Called with the name of each step of a long computation."""
 
 
 def scalar(value: ScalarLike) -> Scalar:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from .._errors import InputError
 from .._format import described
+from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .compiling import one_blas_thread
 from .fit_result import Fit
@@ -29,7 +30,7 @@ def fit(
     model: Model | None = None,
     *,
     threshold_MPa: float = THRESHOLD_MPA,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Fit:
     """Fit particles, noise and population of a campaign: where samplers start, and in what coordinates.
 
@@ -39,9 +40,9 @@ def fit(
         InputError: if no particle can be used; for an argument of the wrong kind or out of its range.
     """
     campaign = check_tests(campaign)
-    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
+    progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     with numbers_in_reach(campaign):
-        selection, found, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+        selection, found, _ = prepare(campaign, model, threshold_MPa, progress=progress)
     return found.first(len(selection.kept))
 
 

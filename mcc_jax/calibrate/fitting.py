@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._errors import InputError
 from .._memory import make_room
+from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
 from .data import Selection, Tests, longer, point_noise_um, select
@@ -59,7 +59,7 @@ def prepare(
     *,
     most_points: int = MOST_POINTS,
     start: Start | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
     """Select points and particles, pad to whole blocks, and fit: what every calibration begins with.
@@ -74,7 +74,7 @@ def prepare(
     """
     make_room()
     model, note = in_own_units(campaign, model)
-    tell("selecting points")
+    progress("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
     selection = selection if note is None else replace(selection, notes=(*selection.notes, note))
     require_same(selection.tests)
@@ -85,7 +85,7 @@ def prepare(
             "start is of other particles or effects", remedy="Give the fit of the same campaign and the same model."
         )
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    found = fit_tests(tests, model, read_out, block=size, start=start, tell=tell, **settings)
+    found = fit_tests(tests, model, read_out, block=size, start=start, progress=progress, **settings)
     parts = (found.point.latent, found.point.zero, found.mode, found.covariance)
     if not all(np.isfinite(np.asarray(part)).all() for part in parts):
         raise beyond_numbers(campaign, selection)
@@ -132,8 +132,8 @@ class _Fitter:
     `own` are this process's tests, `weighted` all and its own tests with the weights that inference takes.
     """
 
-    def __init__(self, tests: Tests, model: Model, blocks: Blocks, tell: Callable[[str], None]) -> None:
-        self.model, self.blocks, self.tell = model, blocks, tell
+    def __init__(self, tests: Tests, model: Model, blocks: Blocks, progress: Progress) -> None:
+        self.model, self.blocks, self.progress = model, blocks, progress
         self.tests, self.count = tests, count_of(tests)
         if model.robust:
             self.tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
@@ -218,7 +218,7 @@ class _Fitter:
 
     def estimate_noise(self, uncertainty: bool) -> None:
         """The four numbers of the noise, of very many particles from some of them."""
-        self.tell("estimating the noise")
+        self.progress("estimating the noise")
         m, blocks, own, linear, start = self.model, self.blocks, self.own, self.linear, self.noise.noise
         if blocks.number > NOISE_BLOCKS:
             rows = np.linspace(0, self.count - 1, NOISE_BLOCKS * blocks.size).astype(int)
@@ -250,7 +250,7 @@ class _Fitter:
 
         A block takes as long as its slowest particle, and nearly every block has one that is slow.
         """
-        self.tell("fitting every particle")
+        self.progress("fitting every particle")
         arrays = tuple(jnp.asarray(np.asarray(v)) for v in (white, centre, width, theta))
 
         def fit(blocks: Blocks, own: Parts, arrays: Any, starts: Parts, most_steps: int) -> ParticleFits:
@@ -325,7 +325,7 @@ def fit_tests(
     rounds: int = ROUNDS,
     block: int = 0,
     start: Start | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> Fit:
     """Fit particles, noise and population.
 
@@ -344,7 +344,7 @@ def fit_tests(
     """
     check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
     N, effects, count = len(tests), bool(model.effects), count_of(tests)
-    fitter = _Fitter(tests, model, Blocks(N, block), tell)
+    fitter = _Fitter(tests, model, Blocks(N, block), progress)
     first = fitter.begin(max(read_out_um, 1e-4)) if start is None else fitter.begin_at(start)
     begun = 0 if start is None else rounds
     free, turn = None, begun
@@ -356,7 +356,7 @@ def fit_tests(
             fitter.summarise()
         else:  # with effects no round knows that it is the last
             fitter.take_noise(uncertainty=effects or turn >= rounds - 1)
-        tell("fitting the population")
+        progress("fitting the population")
         target = LogPosterior(model, fitter.marginal)
         before = target.unconstrain(first) if free is None else free
         target = careful_enough(before, target, count)
@@ -454,9 +454,9 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, 
 
 
 def checked_settings(
-    progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any
-) -> tuple[Callable[[str], None], Model, float]:
+    progress: Progress | None, model: Model | None, threshold_MPa: Any
+) -> tuple[Progress, Model, float]:
     """What all calibrations share, with defaults filled in; refuses what is of the wrong kind or out of its range."""
-    tell = progress or (lambda _: None)
+    progress = progress or (lambda _: None)
     threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    return tell, model or Model(), threshold
+    return progress, model or Model(), threshold

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -14,6 +13,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._format import described
+from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .compiling import one_blas_thread
 from .data import Selection, Tests, ranges_um
@@ -288,7 +288,7 @@ def least_squares(
     loss: Loss = "linear",
     seed: int = 0,
     without_flagged: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> LeastSquares:
     r"""Least squares for a, modulus, and every particle's C1, C3, C5 and zero at once.
 
@@ -314,18 +314,20 @@ def least_squares(
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
-    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
+    progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     arguments.choice(loss, get_args(Loss), "loss")
     if model.robust and loss != "linear":
         raise InputError("robust noise and a robust loss exclude each other", remedy="Take one of them.")
     with numbers_in_reach(campaign):
-        selection, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell, correlated=loss == "linear", rounds=1)
+        selection, fit, _ = prepare(
+            campaign, model, threshold_MPa, progress=progress, correlated=loss == "linear", rounds=1
+        )
         tests, population = fit.tests, fit.population
         further = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
         priors = model.zero_prior, jnp.asarray(np.array(further).reshape(-1, 2))
         settings = Pooled(fit.filters, population, *priors, model.forms, model.scatter, loss)
-        tell("fitting all particles together")
+        progress("fitting all particles together")
         flatness = np.asarray(tests.flatness)
         low, high = -0.9 / max(flatness.max(), 1e-3), -0.9 / min(flatness.min(), -1e-3)
         starts = [float(population.a), *(a for a in SHAPES if low < a < high)]

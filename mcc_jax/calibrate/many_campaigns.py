@@ -62,13 +62,13 @@ def calibrate_many(
         if not isinstance(item, Campaign):  # the error of a damaged one takes its place
             check_campaign(item, f"campaign {i}")
     results: list[Calibration | Exception] = []
-    tell = progress or (lambda _, __: None)
+    progress = progress or (lambda _, __: None)
 
     for i, campaign in enumerate(queue):
         try:
-            step = partial(tell, i)
+            step = partial(progress, i)
             results.append(calibrate(campaign, threshold_MPa=threshold_MPa, progress=step, **settings))
         except Exception as error:  # whatever it is, it takes its campaign's place
             results.append(error)
-        tell(i, "failed" if isinstance(results[i], Exception) else "done")
+        progress(i, "failed" if isinstance(results[i], Exception) else "done")
     return results

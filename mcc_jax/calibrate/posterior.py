@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
@@ -11,6 +10,7 @@ import jax
 import numpy as np
 
 from .. import arguments
+from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..campaign.findings import worst
 from .compiling import imported_meanwhile, one_blas_thread
@@ -214,7 +214,7 @@ def sample(
     seed: int = 0,
     without_flagged: bool = True,
     start: Start | Fit | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Posterior:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
 
@@ -247,7 +247,7 @@ def sample(
     started = time.perf_counter()
     imported_meanwhile("scipy.stats", "arviz_stats.base.array")
     campaign = check_tests(campaign)
-    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
+    progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     arguments.choice(mode, get_args(Mode), "mode")
     chains, draws = (arguments.whole(n, name, least=1) for n, name in ((chains, "chains"), (draws, "draws")))
@@ -255,13 +255,13 @@ def sample(
     fast = mode == "fast"
     with numbers_in_reach(campaign):
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
-        selection, fit, size = prepare(campaign, model, threshold_MPa, start=begin, tell=tell)
-        tell("sampling the population" if fast else "sampling everything")
+        selection, fit, size = prepare(campaign, model, threshold_MPa, start=begin, progress=progress)
+        progress("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = worst(check_plausibility(campaign)) != "error"
         kept = fit.first(len(selection.kept))
         drawn = draw_fast(key, fit, length, size, fallback=likely) if fast else draw_joint(key, kept, length)
-    tell("diagnosing")
+    progress("diagnosing")
     calibration = Posterior(
         campaign=campaign,
         selection=selection,

@@ -16,7 +16,6 @@ from .._store import Stage, results
 from . import options as common
 from .session import (
     NOT_CONVERGED,
-    Tell,
     joint_model,
     listed,
     provenance,
@@ -33,6 +32,7 @@ from .session import (
 )
 
 if TYPE_CHECKING:
+    from .._types import Progress
     from ..calibrate import LeastSquares, PaperCalibration, Posterior
     from ..campaign import Campaign
 
@@ -131,8 +131,8 @@ def calibrate(
         if given and method not in methods:
             option = "--effect" if name == "effects" else "--" + name.replace("_", "-")
             raise click.UsageError(f"{option} belongs to --method {' or '.join(methods)}, not to {method}.")
-    with session(12) as tell:
-        data = read_without(campaign, options["leave_out"], tell)
+    with session(12) as progress:
+        data = read_without(campaign, options["leave_out"], progress)
         if options["reference"] is not None:
             require_particle(options["reference"], data, "--reference")
         # What says how a result of this method comes about.
@@ -141,8 +141,8 @@ def calibrate(
         }
         origin = provenance("calibrate", campaign, settings)
         with results(out) as stage:
-            calibration = _calibrated(data, method, options, tell)
-            content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, tell=tell)
+            calibration = _calibrated(data, method, options, progress)
+            content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, progress=progress)
     from ..calibrate.summary import quantities
 
     if as_json:
@@ -168,11 +168,11 @@ def calibrate(
     return None if content["converged"] else NOT_CONVERGED
 
 
-def _calibrated(data: Campaign, method: str, options: dict[str, Any], tell: Tell) -> Calibration:
+def _calibrated(data: Campaign, method: str, options: dict[str, Any], progress: Progress) -> Calibration:
     from ..calibrate import calibrate_paper, least_squares, sample
 
     def chosen(*names: str) -> dict[str, Any]:
-        return {name: options[name] for name in (*names, "threshold_MPa", "seed")} | {"progress": tell}
+        return {name: options[name] for name in (*names, "threshold_MPa", "seed")} | {"progress": progress}
 
     if method == "paper":
         return calibrate_paper(data, **chosen("objective", "reference", "unloading", "strain_scaling"))
@@ -185,7 +185,7 @@ def _calibrated(data: Campaign, method: str, options: dict[str, Any], tell: Tell
 
 
 def write_calibration(
-    calibration: Calibration, stage: Stage, *, origin: Mapping[str, Any], figures: bool, tell: Tell
+    calibration: Calibration, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
 ) -> dict[str, Any]:
     """Write the calibration, the figures and, if there is one, the posterior into the stage.
 
@@ -194,10 +194,10 @@ def write_calibration(
     """
     from ..calibrate import Posterior, write_posterior
 
-    names = write_figures(stage, RESULT, functools.partial(_draw, calibration) if figures else None, tell)
+    names = write_figures(stage, RESULT, functools.partial(_draw, calibration) if figures else None, progress)
     files = [ARCHIVE]
     if isinstance(calibration, Posterior):
-        tell("writing the posterior")
+        progress("writing the posterior")
         write_posterior(calibration, stage.folder / POSTERIOR)
         files.append(POSTERIOR)
     ours = "|".join((POSTERIOR, ARCHIVE))

@@ -75,7 +75,7 @@ def convert(
     """
     if diameters is not None and not diameters.strip():
         raise click.BadParameter("it is empty.", param_hint="--diameters")
-    with session(3) as tell:
+    with session(3) as progress:
         import numpy as np
 
         from ..campaign import (
@@ -88,14 +88,14 @@ def convert(
             write_campaign,
         )
 
-        tell("reading")
+        progress("reading")
         sizes = None if diameters is None else read_diameters(diameters)
         given = [*mapping, *([] if diameters is None else [Path(diameters)])]
         skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
         campaign = read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=skip)
-        tell("finding the segments")
+        progress("finding the segments")
         segments = [Counter(part.kind for part in find_segments(curve)) for curve in campaign.curves]
-        tell("writing")
+        progress("writing")
         conversion = campaign.metadata.other.get("conversion", {})
         other = {**campaign.metadata.other, "conversion": {"seed": seed, **conversion}}
         with results(out) as stage:

@@ -18,9 +18,10 @@ from . import options as common
 from .calibrate import say_state, say_warnings, write_calibration
 from .discover import DISCOVERY, write_discovery
 from .report import REPORT
-from .session import Tell, provenance, say, say_files, say_table, session
+from .session import provenance, say, say_files, say_table, session
 
 if TYPE_CHECKING:
+    from .._types import Progress
     from ..campaign import Campaign
     from ..simulate import HiddenEffect
 
@@ -57,17 +58,17 @@ def demo(out: Path, seed: int) -> None:
     Example:
       mcc-jax demo --out try --seed 1
     """
-    with session(68) as tell, results(out) as stage:
+    with session(68) as progress, results(out) as stage:
         secret = sealed_answer(seed)
         say("Something that the law does not contain is hidden in simulated tests. The answer is sealed, SHA-256:")
         say(f"  {secret.sha256}", bold=True)
         hidden, none = ({"seed": seed, "hidden": what} for what in ("sealed", "nothing"))
-        calibration, found = _job(stage, secret.effect, hidden, tell)
+        calibration, found = _job(stage, secret.effect, hidden, progress)
         (stage.folder / SEALED).write_text(secret.text, encoding="utf-8")
         inner = Stage(stage.directory / NOTHING, stage.folder / NOTHING)
         inner.folder.mkdir()
         absent = dataclasses.replace(secret.effect, amplitude=0.0)  # the law alone, by the program compiled above
-        _, nothing = _job(inner, absent, none, lambda step: tell(f"nothing hidden: {step}"))
+        _, nothing = _job(inner, absent, none, lambda step: progress(f"nothing hidden: {step}"))
         stage.stale += [f"{NOTHING}/{name}" for name in inner.stale]
     answer = json.loads(secret.text)
     say()
@@ -108,7 +109,7 @@ def demo(out: Path, seed: int) -> None:
 
 
 def _job(
-    stage: Stage, effect: HiddenEffect, settings: dict[str, Any], tell: Tell
+    stage: Stage, effect: HiddenEffect, settings: dict[str, Any], progress: Progress
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Simulate, calibrate, discover, report; the contents of the two results."""
     from ..calibrate import sample
@@ -116,17 +117,17 @@ def _job(
     from ..discovery import discover
     from ..report import read_results, report_page
 
-    tell("simulating the campaign")
+    progress("simulating the campaign")
     campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
     write_campaign(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, folder="campaign")
     content = write_calibration(
-        sample(campaign, seed=seed, progress=tell), stage, origin=origin, figures=True, tell=tell
+        sample(campaign, seed=seed, progress=progress), stage, origin=origin, figures=True, progress=progress
     )
-    found = discover(campaign, experiments=False, seed=seed, progress=tell)
-    missing = write_discovery(found, stage, origin=origin, figures=True, tell=tell)
+    found = discover(campaign, experiments=False, seed=seed, progress=progress)
+    missing = write_discovery(found, stage, origin=origin, figures=True, progress=progress)
     name = stage.directory.resolve().name
-    page = report_page(read_results(stage.folder, name=name), seed=seed, progress=tell)
+    page = report_page(read_results(stage.folder, name=name), seed=seed, progress=progress)
     (stage.folder / REPORT).write_text(page, encoding="utf-8")
     return content, missing
 

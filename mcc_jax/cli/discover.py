@@ -13,7 +13,6 @@ from .._errors import InputError
 from .._store import Stage, results
 from . import options as common
 from .session import (
-    Tell,
     joint_model,
     provenance,
     read_without,
@@ -29,6 +28,7 @@ from .session import (
 )
 
 if TYPE_CHECKING:
+    from .._types import Progress
     from ..discovery import Discovery
 
 DISCOVERY, POWER = "discovery.json", "power.json"
@@ -82,18 +82,18 @@ def discover(
       mcc-jax discover my-tests --out found
       mcc-jax discover my-tests --out found --exclude thermal_drift --unloading punch
     """
-    with session(20) as tell:
+    with session(20) as progress:
         from ..discovery import discover as find
 
         require_mechanisms(options["exclude"])
-        data = read_without(campaign, options["leave_out"], tell)
+        data = read_without(campaign, options["leave_out"], progress)
         parts = {"experiments": not no_experiments, "posterior": not no_posterior}
         origin = provenance("discover", campaign, options | {"held_out": not no_held_out} | parts)
         with results(out) as stage:
             model = joint_model(options)
             chosen = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")}
-            found = find(data, model=model, confirm=not no_held_out, progress=tell, **parts, **chosen)
-            content = write_discovery(found, stage, origin=origin, figures=not no_figures, tell=tell)
+            found = find(data, model=model, confirm=not no_held_out, progress=progress, **parts, **chosen)
+            content = write_discovery(found, stage, origin=origin, figures=not no_figures, progress=progress)
     if as_json:
         say_json(content)
         return
@@ -125,7 +125,7 @@ def require_mechanisms(names: tuple[str, ...]) -> None:
 
 
 def write_discovery(
-    found: Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, tell: Tell
+    found: Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
 ) -> dict[str, Any]:
     """Write `discovery.json` and the figures into the stage; see `write_calibration`."""
 
@@ -134,7 +134,7 @@ def write_discovery(
 
         return discovery_figures(found)
 
-    names = write_figures(stage, DISCOVERY, draw if figures else None, tell)
+    names = write_figures(stage, DISCOVERY, draw if figures else None, progress)
     return found.write(stage.folder, figures=names, provenance=dict(origin))
 
 
@@ -190,19 +190,19 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
       mcc-jax simulate --particles twelve.csv --out planned --levels 0.5,1,1 --hold-s 20 --noise-um 0.05 --noise-mN 0.05
       mcc-jax power planned --out planned
     """
-    with session(20) as tell:
+    with session(20) as progress:
         from ..discovery import power_of_campaign
         from ..effects import LIBRARY
 
         require_mechanisms(options["exclude"])
-        data = read_without(campaign, (), tell)
+        data = read_without(campaign, (), progress)
         with results(out) as stage:
             found = power_of_campaign(
                 data,
                 library={name: m for name, m in LIBRARY.items() if name not in options["exclude"]},
                 model=joint_model(options),
                 threshold_MPa=options["threshold_MPa"],
-                progress=tell,
+                progress=progress,
             )
             content = found.to_json()
             write_result(stage, POWER, content)

@@ -58,14 +58,14 @@ def export(
     """
     if diameters is not None and not diameters.strip():
         raise click.BadParameter("it is empty.", param_hint="--diameters")
-    with session(3) as tell:
+    with session(3) as progress:
         from ..export import read_calibration, write_export
 
-        tell("reading the calibration")
+        progress("reading the calibration")
         law, shown, origin = read_calibration(
             directory, particle=particle, diameters=diameters, allow_not_monotone=allow_not_monotone
         )
-        tell("writing")
+        progress("writing")
         with results(out) as stage:
             files = write_export(form, law, shown, stage.folder, origin=origin, seed=seed)
     whose = "the population" if particle is None else f"particle {particle}"

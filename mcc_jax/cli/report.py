@@ -32,12 +32,12 @@ def report(folder: Path, out: Path | None, campaign: Path | None, seed: int) -> 
       mcc-jax report mcc-jax-demo
       mcc-jax report my-fit --campaign my-tests --out for-my-colleague
     """
-    with session(4) as tell:
+    with session(4) as progress:
         from ..report import read_results, report_page
 
-        tell("reading the results")
+        progress("reading the results")
         found = read_results(folder, campaign)
-        page = report_page(found, seed=seed, progress=tell)
+        page = report_page(found, seed=seed, progress=progress)
         with results(out or folder) as stage:
             (stage.folder / REPORT).write_text(page, encoding="utf-8")
     for text in found.cautions:

@@ -22,10 +22,10 @@ from .._store import Stage, json_text
 from ..files import RESULT_BYTES, read_regular
 
 if TYPE_CHECKING:
+    from .._types import Progress
     from ..calibrate import Model
     from ..campaign import Campaign
 
-Tell = Callable[[str], None]
 PROGRAM = "mcc-jax"
 DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 FIGURES = "figures"
@@ -33,13 +33,13 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy
 
 
 @contextlib.contextmanager
-def session(steps: int) -> Iterator[Tell]:
+def session(steps: int) -> Iterator[Progress]:
     """Double precision, and progress on standard error: a bar on a terminal, a line for each step elsewhere.
 
     Yields a function to be called with the name of each step as it begins, `steps` times in all.
     """
-    with _progress(steps) as tell:
-        tell("loading the library")
+    with _progress(steps) as progress:
+        progress("loading the library")
         for noisy in ("jax", "matplotlib"):  # hints about accelerators and caches are not for a pipe
             logging.getLogger(noisy).setLevel(logging.ERROR)
         import jax
@@ -47,7 +47,7 @@ def session(steps: int) -> Iterator[Tell]:
         jax.config.update("jax_enable_x64", True)
         _keep_compiled(jax.config)
         require_device()
-        yield tell
+        yield progress
 
 
 def require_device() -> None:
@@ -102,19 +102,20 @@ def _private(folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _progress(steps: int) -> Iterator[Tell]:
+def _progress(steps: int) -> Iterator[Progress]:
     if sys.stderr is None:
         yield lambda _: None
         return
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
-        with _logged(sys.stderr) as tell:
-            yield tell
+        with _logged(sys.stderr) as progress:
+            yield progress
         return
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(24), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
+    text = rich.TextColumn("{task.description}", markup=False)
+    columns = (rich.SpinnerColumn(), text, rich.BarColumn(24), rich.TimeElapsedColumn())
+    with rich.Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
         task = bar.add_task("", total=steps + 1, completed=-1)
         yield lambda step: bar.update(task, description=step, advance=1)
 
@@ -124,14 +125,14 @@ QUIET_S = 2.0
 
 
 @contextlib.contextmanager
-def _logged(stream: Any) -> Iterator[Tell]:
+def _logged(stream: Any) -> Iterator[Progress]:
     """Write a line for each step as it begins, with the seconds since the command began.
 
     Lines are held back for `QUIET_S`, counted from the second step, so that bad input is answered by its error alone.
     """
     began, waiting, lock, shown = time.monotonic(), list[str](), threading.Lock(), threading.Event()
 
-    def tell(step: str) -> None:
+    def progress(step: str) -> None:
         with lock:
             waiting.append(f"{PROGRAM}: {time.monotonic() - began:6.1f} s  {step}\n")
             if len(waiting) == 2 and timer.ident is None:
@@ -149,13 +150,13 @@ def _logged(stream: Any) -> Iterator[Tell]:
     timer = threading.Timer(QUIET_S, write)
     timer.daemon = True
     try:
-        yield tell
+        yield progress
     finally:
         timer.cancel()
         if timer.ident is not None:
             timer.join()
     if shown.is_set():
-        tell("done")
+        progress("done")
 
 
 def say(text: str = "", **style: Any) -> None:
@@ -176,11 +177,11 @@ def say_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
         say(line(row))
 
 
-def read_without(folder: Path, left_out: tuple[str, ...], tell: Tell) -> Campaign:
+def read_without(folder: Path, left_out: tuple[str, ...], progress: Progress) -> Campaign:
     """The campaign in a folder without the particles of `--leave-out`."""
     from ..campaign import read_campaign
 
-    tell("reading the campaign")
+    progress("reading the campaign")
     campaign = read_campaign(folder)
     for name in left_out:
         require_particle(name, campaign, "--leave-out")
@@ -237,13 +238,15 @@ def listed(result: Path, key: str, pattern: str) -> list[str]:
     return [n for n in names if isinstance(n, str) and re.fullmatch(pattern, n)] if isinstance(names, list) else []
 
 
-def write_figures(stage: Stage, result: str, draw: Callable[[], Mapping[str, Any]] | None, tell: Tell) -> list[str]:
+def write_figures(
+    stage: Stage, result: str, draw: Callable[[], Mapping[str, Any]] | None, progress: Progress
+) -> list[str]:
     """Draw into the stage, and give the figures' names; `draw` is None for no figures.
 
     Figures that an earlier file `result` lists as its own, and this run does not draw, become stale.
     """
     names: list[str] = []
-    tell("writing" if draw is None else "drawing the figures")
+    progress("writing" if draw is None else "drawing the figures")
     if draw is not None:
         from ..plots import save_figures
 

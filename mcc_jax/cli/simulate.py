@@ -112,20 +112,20 @@ def simulate(out: Path, **options: Any) -> None:
       rate = 4.0
     """
     _refuse_contradictions(options)
-    with session(3) as tell:
+    with session(3) as progress:
         from ..campaign import write_campaign
 
-        tell("reading the input")
+        progress("reading the input")
         sizes = _sizes(options["particles"])
         hidden = _hidden_effects(options["effects"], sizes)
-        tell("simulating")
+        progress("simulating")
         laws = _laws(options, sizes)
         programme = _programme(options)
         peaks = _peaks(options, programme, laws, sizes)
         _check_size(programme, peaks, options["programme"])
         with results(out) as stage:
             campaign = _campaign(laws, sizes, peaks, programme, options, hidden)
-            tell("writing")
+            progress("writing")
             write_campaign(campaign, stage.folder)
     points = [len(curve) for curve in campaign.curves]
     forces = [curve.force_mN.max() for curve in campaign.curves]

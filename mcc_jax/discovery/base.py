@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._types import Progress
 from ..calibrate.data import Selection, Tests, longer, ranges_um, root_mean_squares
 from ..calibrate.distributions import SpreadCoordinate
 from ..calibrate.fitting import in_own_units, prepare
@@ -134,7 +135,7 @@ class Base:
         return tuple(map(self.name_of, range(len(self.tests))))
 
 
-def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Callable[[str], None]) -> Base:
+def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress: Progress) -> Base:
     """Fit the base law to a campaign.
 
     Of a material that the law was not made for, and does not fit, only some readings of each branch are compared: what
@@ -147,14 +148,14 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Ca
     """
     with numbers_in_reach(campaign):
         model, foreign = in_own_units(campaign, model)
-        selection, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+        selection, fit, _ = prepare(campaign, model, threshold_MPa, progress=progress)
         fit = fit.first(len(selection.kept))
         share = np.median(root_mean_squares(fit.tests, fit.residual) / ranges_um(fit.tests))
         coarse = foreign is not None and bool(share > DECISIONS.foreign_misfit)
         if coarse:
             branches = int(np.median([len(find_segments(curve)) for curve in campaign.curves]))
             most = DECISIONS.readings * branches
-            selection, fit, _ = prepare(campaign, model, threshold_MPa, most_points=most, tell=tell)
+            selection, fit, _ = prepare(campaign, model, threshold_MPa, most_points=most, progress=progress)
             fit = fit.first(len(selection.kept))
     p = fit.population
     shift = float(jnp.mean(jnp.log1p(p.a * fit.tests.flatness)))

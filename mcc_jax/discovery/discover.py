@@ -11,6 +11,7 @@ from typing import Any
 from .. import arguments
 from .._errors import InputError
 from .._format import listed, plain
+from .._types import Progress
 from ..calibrate import Model, Posterior, sample
 from ..calibrate.compiling import one_blas_thread
 from ..calibrate.data import root_mean_squares
@@ -36,7 +37,6 @@ from .search import Search
 from .sentences import summary_of
 from .settings import AT_PEAKS, DECISIONS
 
-Tell = Callable[[str], None]
 _Begun = tuple[Search, list[dict[str, str]], list[Finding]]
 
 
@@ -52,7 +52,7 @@ def discover(
     experiments: bool = True,
     posterior: bool = True,
     seed: int = 0,
-    progress: Tell | None = None,
+    progress: Progress | None = None,
 ) -> Discovery:
     """Find where law and campaign disagree, name what is missing, and show on held-out particles that it helps.
 
@@ -82,7 +82,7 @@ def discover(
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
+    progress, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
         arguments.flag(value, name)
@@ -95,11 +95,11 @@ def discover(
         )
         found = Discovery("FIT_NOT_CONVERGED", summary, None, None, seed, 0.0)
         return _finished(found, (*wrong, *findings), started)
-    begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, tell=tell)
+    begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, progress=progress)
     search, missing, left_out = begun(campaign, findings)
-    p_any = _run(search, seed, tell)
+    p_any = _run(search, seed, progress)
     if _is_gap(search, p_any):
-        explained = _not_tared(campaign, search, begun, seed, tell)
+        explained = _not_tared(campaign, search, begun, seed, progress)
         search, p_any, missing, left_out = explained or (search, p_any, missing, left_out)
     base, findings = search.base, (*findings, *left_out)
     ranking = answer.ranking_of(search)
@@ -121,14 +121,14 @@ def discover(
         return _finished(_of_law_alone(found, search), findings, started)
     winner = answer.leader_of(search).names
     if confirm and base.holds_out:
-        tell("held-out particles")
+        progress("held-out particles")
         held = held_out(search, winner)
         found = replace(found, held_out=held)
         assert held.residual_um is not None
         objection = held.objection([root_mean_squares(base.tests, one) for one in held.residual_um], base.range_um)
         if objection is not None:
             return _finished(_taken_back(_of_law_alone(found, search), winner, objection), findings, started)
-    found = _named(found, search, known, tell)
+    found = _named(found, search, known, progress)
     separate = [e.mechanism for e in found.effects if located(e.variant)]
     if separate:
         note = (
@@ -137,9 +137,9 @@ def discover(
         )
         found = replace(found, notes=(*found.notes, note))
     elif posterior and found.effects:
-        found = _sampled(found, search, threshold_MPa, seed, tell)
+        found = _sampled(found, search, threshold_MPa, seed, progress)
     if experiments and found.candidate_set and len(found.candidate_set) == 1:
-        tell("next experiments")
+        progress("next experiments")
         alone = tuple(n for n in found.candidate_set[0] if n not in found.paired)
         found = replace(found, next_experiments=tuple(next_experiments(search, alone)))
     return _finished(found, findings, started)
@@ -165,24 +165,24 @@ def _begun(
     model: Model,
     known: Mapping[str, Mechanism],
     threshold_MPa: float,
-    tell: Tell,
+    progress: Progress,
 ) -> _Begun:
     """The search with the law alone in it, what these tests cannot say, and what was left out."""
-    base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, tell)
+    base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, progress)
     known = without_punch(known, base)
     testable, missing = untestable(known, available_data(campaign))
     if not testable:
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
-    tell("signatures of all effects")
+    progress("signatures of all effects")
     with numbers_in_reach(base.campaign):
-        return Search(base, testable, tell, whole=known), missing, left_out
+        return Search(base, testable, progress, whole=known), missing, left_out
 
 
-def _run(search: Search, seed: int, tell: Tell) -> float:
+def _run(search: Search, seed: int, progress: Progress) -> float:
     """Work all hypotheses out; how likely so much evidence of anything is by chance."""
     with numbers_in_reach(search.base.campaign):
         search.run()
-        tell("is anything missing")
+        progress("is anything missing")
         return p_anything(search, seed)
 
 
@@ -192,7 +192,7 @@ def _is_gap(search: Search, p_any: float) -> bool:
 
 
 def _not_tared(
-    campaign: Campaign, search: Search, begun: Callable[..., _Begun], seed: int, tell: Tell
+    campaign: Campaign, search: Search, begun: Callable[..., _Begun], seed: int, progress: Progress
 ) -> tuple[Search, float, list[dict[str, str]], list[Finding]] | None:
     """The search with what the tests begin at taken off their force, where the law alone then does; None elsewhere.
 
@@ -201,7 +201,7 @@ def _not_tared(
     zero = open_zero(campaign)
     if zero is None:
         return None
-    tell("the same, had the load cell not been tared")
+    progress("the same, had the load cell not been tared")
     assert campaign.raw is not None
     tared = check_tests(campaign.raw, zero_mN=zero)
     other, missing, left_out = begun(tared, campaign_findings(tared))
@@ -209,7 +209,7 @@ def _not_tared(
     # Readings without force are not compared, so evidence counts by the reading.
     if other.null.log_evidence / other.base.readings <= best / search.base.readings:
         return None
-    p_any = _run(other, seed, tell)
+    p_any = _run(other, seed, progress)
     if _is_gap(other, p_any):
         return None
     text = (
@@ -221,7 +221,7 @@ def _not_tared(
 
 
 def _settled_fit(
-    campaign: Campaign, findings: Sequence[Finding], model: Model, threshold_MPa: float, tell: Tell
+    campaign: Campaign, findings: Sequence[Finding], model: Model, threshold_MPa: float, progress: Progress
 ) -> tuple[Base, list[Finding]]:
     """The base fit of the tests that are of one kind, and what is said of those left out.
 
@@ -234,7 +234,7 @@ def _settled_fit(
         text = f"{named(unsafe, len(campaign))}: cannot be relied on, as said above; no part in the search"
         left_out.append(Finding("left out", "warning", text, "", unsafe))
         campaign = campaign.without(*unsafe)
-    base = base_fit(campaign, model, threshold_MPa=threshold_MPa, tell=tell)
+    base = base_fit(campaign, model, threshold_MPa=threshold_MPa, progress=progress)
     outlying, snapping = unlike_others(base.names, base.rms_um, base.range_um), base.snapping
     without: tuple[str, ...] = ()
     if outlying is not None:
@@ -246,11 +246,11 @@ def _settled_fit(
         left_out.append(Finding("snap-through", "info", text, "", snapping))
         without = (*without, *(name for name in snapping if name not in without))
     if without:
-        base = base_fit(campaign.without(*without), model, threshold_MPa=threshold_MPa, tell=tell)
+        base = base_fit(campaign.without(*without), model, threshold_MPa=threshold_MPa, progress=progress)
     return base, left_out
 
 
-def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tell: Tell) -> Discovery:
+def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], progress: Progress) -> Discovery:
     """The answer with the leading hypothesis: effects or a formula, where, and what it did to the parameters."""
     leader = answer.leader_of(search)
     winner: Names = leader.names
@@ -265,7 +265,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         leads=answer.leads_of(search, winner),
     )
     if winner == UNLISTED:
-        tell("a formula of its own")
+        progress("a formula of its own")
         return replace(found, verdict="UNLISTED", closure=closure(search, found.seed))
     effects = answer.effects_of(search, winner, answer.name_probabilities(search), found.p_any)
     pairs = answer.instead_of(search, winner)
@@ -303,9 +303,9 @@ def _taken_back(found: Discovery, winner: Names, objection: str) -> Discovery:
     return replace(found, verdict="FIT_NOT_CONVERGED", summary=summary)
 
 
-def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, tell: Tell) -> Discovery:
+def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, progress: Progress) -> Discovery:
     """The answer with the posterior of the law with effects, if it may be believed."""
-    tell("posterior of the law with effects")
+    progress("posterior of the law with effects")
     base, fitted = search.base, answer.leader_of(search).at
     same = fitted is not None and found.model is not None and fitted.variants == found.model.effects
     drawn: Posterior = sample(
@@ -315,7 +315,7 @@ def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, 
         seed=seed,
         without_flagged=False,
         start=fitted.start(base) if fitted is not None and same else None,
-        progress=tell,
+        progress=progress,
     )
     if drawn.failures():
         note = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from jaxtyping import Array
 from .. import arguments
 from .._errors import InputError
 from .._format import described, number, table
+from .._types import Progress
 from ..calibrate import Model
 from ..calibrate.data import select
 from ..calibrate.estimates import finite
@@ -191,7 +192,7 @@ def power_of_campaign(
     library: Mapping[str, Mechanism] = LIBRARY,
     model: Model | None = None,
     threshold_MPa: float = 0.0,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Power:
     """What a campaign can show: one that was simulated as planned, noise included, or one that was measured.
 
@@ -206,9 +207,9 @@ def power_of_campaign(
         InputError: if no particle can be used.
     """
     check_campaign(campaign)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
-    base = base_fit(campaign, without_effects(assumed), threshold_MPa=threshold_MPa, tell=tell)
-    tell("signatures of all effects")
+    progress, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
+    base = base_fit(campaign, without_effects(assumed), threshold_MPa=threshold_MPa, progress=progress)
+    progress("signatures of all effects")
     return power_of(*screened(base, library))
 
 

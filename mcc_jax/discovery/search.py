@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from .._types import Progress
 from ..calibrate.compiling import side_by_side
 from ..calibrate.model import Model
 from ..effects import Mechanism, Variant
@@ -39,7 +40,7 @@ class Search:
         self,
         base: Base,
         library: Mapping[str, Mechanism],
-        tell: Callable[[str], None] = lambda _: None,
+        progress: Progress = lambda _: None,
         *,
         whole: Mapping[str, Mechanism] | None = None,
     ) -> None:
@@ -48,10 +49,10 @@ class Search:
         Args:
             base: the tests.
             library: mechanisms that are searched for, with the formulas that the tests can tell.
-            tell: called with the name of each step.
+            progress: called with the name of each step.
             whole: the library with the formulas that the tests cannot tell.
         """
-        self.library, self.tell = library, tell
+        self.library, self.progress = library, progress
         base, start = with_likely_noise(base)
         self.base = base
         places = [base.state]
@@ -297,7 +298,7 @@ class Search:
         rank = {m: float(logsumexp([v for v, _ in f.values()]) - np.log(len(f))) for m, f in order.items()}
         names = sorted(rank, key=lambda m: -rank[m])
         strong = bool(names) and rank[names[0]] - nothing > STRONG
-        self.tell("the serious names, fitted as they are")
+        self.progress("the serious names, fitted as they are")
         serious = names[:CONTENDERS]
         each = FORMULAS if names and rank[names[0]] - nothing > VERY_STRONG else 1
         self.fit_singles(serious, each)
@@ -307,7 +308,7 @@ class Search:
         side_by_side(self.fit_misfit, [self.found[(m,)] for m in serious])
         for m in names[CONTENDERS:]:
             self.found[(m,)] = Hypothesis((m,), rank[m])
-        self.tell("what differs from test to test, and a discrepancy on no list")
+        self.progress("what differs from test to test, and a discrepancy on no list")
         tasks: list[Callable[[], Any]] = [partial(self.discrepancy.added_to, self.base, self.null)]
         tasks += [partial(self.of_their_own, m, self.null) for m in self.not_shared]
         smooth, *ones = side_by_side(call, tasks)
@@ -319,7 +320,7 @@ class Search:
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.log_evidence, at=smooth)
         most = max(x.log_evidence for x in self.found.values())
         if leaders and most - nothing > STRONG:
-            self.tell("two names")
+            self.progress("two names")
             leading = sorted(leaders, key=lambda x: -x.alone)[:2]
             tasks = [partial(self.pairs_of, leading), *(partial(self.fit_discrepancy, x, most) for x in leading)]
             side_by_side(call, tasks)
@@ -330,7 +331,7 @@ class Search:
             pairs = [pair for pair in pairs if pair.log_evidence > first.log_evidence]
             for pair in sorted(pairs, key=lambda x: -x.log_evidence)[:2]:
                 self.other_formulas(pair)
-        self.tell("other kinds of noise")
+        self.progress("other kinds of noise")
         self.other_noise()
         return self
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from .. import arguments
 from .._extras import extra, own_version
 from .._format import interval, listed, number, percent, plain, probability, with_sd
+from .._types import Progress
 from ..calibrate.curves import KINDS, FittedCurve
 from ..calibrate.summary import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
@@ -69,7 +69,7 @@ WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=
 """Blanks at which a line must not break: before a unit, and around the sign of a standard deviation or a power."""
 
 
-def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> str:
+def report_page(results: Results, *, seed: int = 0, progress: Progress | None = None) -> str:
     """One self-contained HTML page of what `read_results` gives; equal input, equal page.
 
     The seed is for the record: nothing here is random. `progress` is called with the name of each step.
@@ -82,11 +82,11 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
     with extra("report"):
         import bokeh  # noqa: F401
         import jinja2  # noqa: F401
-    tell = progress or (lambda _: None)
-    tell("predicting every particle")
+    progress = progress or (lambda _: None)
+    progress("predicting every particle")
     results = results.with_discovery
     shown = compare(results)
-    tell("drawing the page")
+    progress("drawing the page")
     return _environment().get_template("page.html").render(context(results, shown), seed=seed)
 
 

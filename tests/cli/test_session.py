@@ -100,23 +100,23 @@ def log(monkeypatch):
 
 
 def test_in_a_log_each_step_is_a_line_as_it_begins(log):
-    with session._logged(log) as tell:
-        tell("loading")
-        tell("reading")
+    with session._logged(log) as progress:
+        progress("loading")
+        progress("reading")
         deadline = time.monotonic() + 60
         while not log.getvalue() and time.monotonic() < deadline:  # lines do not wait for the next step
             time.sleep(0.01)
         assert log.steps == ["loading", "reading"]
-        tell("fitting")
+        progress("fitting")
         assert log.steps == ["loading", "reading", "fitting"]
     assert log.steps == ["loading", "reading", "fitting", "done"]
 
 
 def test_work_that_fails_is_not_reported_as_done(log):
     def work():
-        with session._logged(log) as tell:
-            tell("loading")
-            tell("reading")
+        with session._logged(log) as progress:
+            progress("loading")
+            progress("reading")
             time.sleep(0.2)
             raise ValueError("no result")
 
@@ -128,9 +128,9 @@ def test_work_that_fails_is_not_reported_as_done(log):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_in_a_log_short_work_is_not_reported(log, monkeypatch, steps):
     monkeypatch.setattr(session, "QUIET_S", 1000.0 if steps == 2 else 0.05)
-    with session._logged(log) as tell:
+    with session._logged(log) as progress:
         for step in range(steps):
-            tell(f"step {step}")
+            progress(f"step {step}")
         time.sleep(0.2)  # loading the library alone is not counted
     assert log.steps == []
 
@@ -140,8 +140,8 @@ def test_a_log_that_nobody_reads_does_not_end_the_work(log, monkeypatch):
         raise BrokenPipeError
 
     monkeypatch.setattr(log, "write", gone)
-    with session._logged(log) as tell:
-        tell("loading")
-        tell("reading")
+    with session._logged(log) as progress:
+        progress("loading")
+        progress("reading")
         time.sleep(0.2)
-        tell("fitting")
+        progress("fitting")

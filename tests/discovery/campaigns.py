@@ -86,4 +86,4 @@ MODEL = Model(modulus_scatter=True)
 
 def base_of(whole):
     """The base fit of a campaign, all points counting."""
-    return base_fit(whole, MODEL, threshold_MPa=0.0, tell=lambda _: None)
+    return base_fit(whole, MODEL, threshold_MPa=0.0, progress=lambda _: None)

@@ -47,7 +47,7 @@ def test_a_record_ends_where_a_sphere_gives_way():
 
 def test_few_readings_are_compared():
     campaign = hard_spheres(8, toe=4e-3)
-    base = base_fit(check_tests(campaign), Model(), threshold_MPa=0.0, tell=lambda _: None)
+    base = base_fit(check_tests(campaign), Model(), threshold_MPa=0.0, progress=lambda _: None)
     assert base.coarse
     assert np.all(np.asarray(base.tests.mask).sum(1) <= 2 * DECISIONS.readings)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, get_args
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ... import arguments
 from ..._errors import InputError
+from ..._types import Progress
 from ...campaign import (
     THRESHOLD_MPA,
     Adjustment,
@@ -233,7 +234,7 @@ def calibrate_paper(
     strain_scaling: StrainScaling | str = StrainScaling.RAW,
     seed: int = 0,
     without_flagged: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> PaperCalibration:
     """The paper's calibration: offset step, shape parameter, master curve, plastic coefficients, effective modulus.
 
@@ -261,8 +262,8 @@ def calibrate_paper(
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
     seed = arguments.seed(seed)
-    tell = progress or (lambda _: None)
-    tell("adjusting the curves")
+    progress = progress or (lambda _: None)
+    progress("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:
         if len(campaign) == 1:
@@ -276,20 +277,20 @@ def calibrate_paper(
         raise refusal(campaign, problem, adjustment.reasons)
     with numbers_in_reach(campaign):
         table = strain_table(adjustment, campaign.diameters_um)
-        tell("fitting the shape parameter")
+        progress("fitting the shape parameter")
         shape = fit_shape_parameter(table)
         shape_reference = _reference_fit(campaign, table, objective, reference)
         chosen = shape_reference if objective == "reference" and shape_reference is not None else shape
-        tell("fitting the plastic coefficients")
+        progress("fitting the plastic coefficients")
         master = master_curve(table, chosen.a)
         plastic = fit_population(master, adjustment.threshold_MPa)
-        tell("fitting the effective modulus")
+        progress("fitting the effective modulus")
         eta = of_each_particle(campaign.diameters_um, lambda p: plastic_shape_factor(p, chosen.a))
         elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
         # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
         modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
         law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
-        tell("predicting every particle")
+        progress("predicting every particle")
         particles = predict_particles(campaign, adjustment, law, eta)
         noise = float(np.median([point_noise_um(curve) for curve in campaign.curves]))
     calibration = PaperCalibration(
