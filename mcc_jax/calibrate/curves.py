@@ -16,10 +16,9 @@ from ..effects import Record
 from ..geometry import Particle
 from ..law import MccLaw
 from .compiling import compiled
-from .data import padded_length, records_of, rows_from_contact
+from .data import MOST_POINTS, padded_length, records_of, rows_from_contact
 from .laws import Variants, laws_of
 from .population import COEFFICIENTS
-from .settings import MOST_POINTS
 
 KINDS = ("load", "hold", "unload", "reload")
 

@@ -32,8 +32,14 @@ from ..campaign.segments import contact_index
 from ..campaign.signal import point_noise
 from ..effects import Record
 from ..geometry import Particle
-from .settings import MOST_POINTS, READING_UM, UNLOADED_FROM
 
+MOST_POINTS = 400  # longer records are thinned to about so many rows
+# Points of unloading below this share of the peak stress are left out: strain there depends on stress with an infinite
+# slope.
+UNLOADED_FROM = 0.05
+# What no record of displacement is better than [um]: counted as misfit at every point, so that the noise of a record
+# without any, of a simulation say, is small but not nothing.
+READING_UM = 2e-4
 LEAST_POINTS = 12  # fewer usable points cannot carry three coefficients, a zero and their noise
 CLIMB = 8.0  # displacement must grow over loading by this many times its noise, or there is no curve to fit
 # Of records with more segments than one for so many rows that are kept, hundreds of cycles, whole cycles are left out:

@@ -11,31 +11,9 @@ import numpy as np
 from ..campaign import Curve
 from .model import Model
 from .population import Population
-from .settings import JUDGEMENT
 
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
 """Diagnostics of methods that draw nothing."""
-
-
-def misfit_note(own_misfit: float) -> str | None:
-    """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
-    if not own_misfit > JUDGEMENT.misfit:
-        return None
-    return (
-        "even with its own C1, C3, C5 the law misses a test's displacements by "
-        f"{100 * own_misfit:.0f} % of their range (median): "
-        "it describes these tests badly, or they are no compressions of single particles"
-    )
-
-
-def noise_note(share: float, by: str) -> str | None:
-    """A sentence if correlated noise has taken up what the law misses, `by` so much, else None."""
-    if not share > JUDGEMENT.noise_share:
-        return None
-    return (
-        f"the law misses displacements by {by}; {100 * share:.0f} % of that is correlated along a test: more likely "
-        "something that the law lacks than noise of the instrument; mcc_jax.discover looks for what it is"
-    )
 
 
 def finite(value: float) -> float | None:

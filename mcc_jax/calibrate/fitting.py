@@ -16,7 +16,7 @@ from .._memory import make_room
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
-from .data import Selection, Tests, longer, point_noise_um, select
+from .data import MOST_POINTS, Selection, Tests, longer, point_noise_um, select
 from .distributions import SpreadCoordinate
 from .fit_result import Fit, population_of
 from .forward import Point, linearise
@@ -29,7 +29,6 @@ from .particle_fit import STEPS, ParticleFits, fit_particles, linear_starts
 from .population import Population
 from .prior_draws import site_values
 from .priors import Priors, check_prior_of_a
-from .settings import MOST_POINTS
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).

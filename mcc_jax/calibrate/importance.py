@@ -27,7 +27,10 @@ from jaxtyping import Array
 
 from .mode import DIFFERENCE, LogPosterior, expanded, log_densities, populations
 from .population import Population
-from .settings import SAMPLING
+
+# A posterior counts as converged with an R-hat of at most, a bulk ESS of at least and a Pareto k of at most this
+# (Vehtari et al. 2021, 2024).
+MOST_RHAT, LEAST_ESS, MOST_PARETO_K = 1.01, 400.0, 0.7
 
 # Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `study_posterior.py`).
 FREEDOM = 10  # degrees of freedom of the Student proposal: its tails are wider than the posterior's
@@ -92,14 +95,14 @@ def sample_weighted(
         weight, k = smoothed_weights(log_weight)
         share = effective_share(weight)
         last = turn == ROUNDS - 1
-        if k <= SAMPLING.pareto_k and (share >= GOOD_SHARE or share * len(free) >= kept or last):
+        if k <= MOST_PARETO_K and (share >= GOOD_SHARE or share * len(free) >= kept or last):
             total = kept if many else min(math.ceil(PROPOSED * kept / share), ROUNDS * trial)
             if total > len(free):
                 mixture.propose(centre, width, total - len(free))
                 free, log_weight = mixture.free, mixture.log_weight
                 weight, k = smoothed_weights(log_weight)
                 share = effective_share(weight)
-            if k <= SAMPLING.pareto_k and share * len(free) >= LEAST:
+            if k <= MOST_PARETO_K and share * len(free) >= LEAST:
                 value = float(cast(Any, logsumexp(log_weight))) - math.log(len(log_weight))
                 error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
                 return Weighted(*_resampled(free, weight, target, chains, draws), value, error)

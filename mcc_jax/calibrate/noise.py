@@ -29,10 +29,9 @@ from tinygp.solvers.quasisep.solver import QuasisepSolver
 
 from .._types import Path, Scalar
 from .compiling import compiled
-from .data import Tests
+from .data import READING_UM, Tests
 from .forward import Linear
 from .priors import NoisePrior
-from .settings import READING_UM
 from .sharding import Blocks, Parts
 from .small_matrices import eliminate
 

@@ -31,11 +31,10 @@ from .._types import Scalar
 from .compiling import compiled, even_batch, side_by_side
 from .data import Tests
 from .forward import Forms, Point, residuals
-from .importance import ordered_resample, pareto_k, relative_scatter, smoothed_weights
+from .importance import MOST_PARETO_K, ordered_resample, pareto_k, relative_scatter, smoothed_weights
 from .marginal import Marginal, ParticleDraw
 from .noise import Whitening
 from .population import Population
-from .settings import SAMPLING
 from .sharding import Blocks, count_of
 
 # Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `bench_scale.py`).
@@ -299,7 +298,7 @@ def weighted(drawer: Drawer, population: Population, length: Length, check_key: 
     particles = drawer.all(check_key, population)
     ratio = np.asarray(particles.log_ratio)
     k = pareto_k(ratio)
-    scattering = np.flatnonzero((relative_scatter(ratio) > SCATTERING) | (k > SAMPLING.pareto_k))
+    scattering = np.flatnonzero((relative_scatter(ratio) > SCATTERING) | (k > MOST_PARETO_K))
     drawer.redraw(pick_key, particles, population, k, scattering, CANDIDATES)
     total = ratio.sum(1)
     chosen, k_joint = _resampled(total, length)
@@ -347,7 +346,7 @@ def corrected(
     keep = max(1, -(-length.total * drawer.count // KEPT))
     some = every(every(population, chosen), keep)
     particles = drawer.all(particle_key, some, 0)
-    scattering = np.flatnonzero((scatter > SCATTERING_OF_MANY) | (k > SAMPLING.pareto_k))
+    scattering = np.flatnonzero((scatter > SCATTERING_OF_MANY) | (k > MOST_PARETO_K))
     drawer.redraw(pick_key, particles, some, k, scattering, CANDIDATES_OF_MANY)
     # The regression shows how the correction changes over the posterior; how large it is, every particle shows alone.
     each = [mean_ratio(ratio[:, i]) for i in range(ratio.shape[1])]

@@ -19,13 +19,13 @@ from .draws import Draws, draw_fast, draw_joint, named_population
 from .estimates import effect_entries, finite, summary
 from .fit_result import Fit
 from .fitting import Start, checked_settings, prepare
+from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
 from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
 from .model import Model
 from .particles import Length
 from .population import COEFFICIENTS
 from .predict import predict_measured
 from .results import PosteriorDraws
-from .settings import SAMPLING
 
 Mode = Literal["fast", "joint"]
 
@@ -79,23 +79,23 @@ class Posterior(PosteriorDraws, Draws):
             ]
         found = []
         slowest = max(self.rhat, key=lambda name: self.rhat[name])
-        if not (rhat := self.rhat[slowest]) <= SAMPLING.rhat:
-            found.append(f"R-hat of {slowest} is {rhat:.3f}, above {SAMPLING.rhat}: draw longer (--draws)")
+        if not (rhat := self.rhat[slowest]) <= MOST_RHAT:
+            found.append(f"R-hat of {slowest} is {rhat:.3f}, above {MOST_RHAT}: draw longer (--draws)")
         fewest = min(self.ess_bulk, key=lambda name: self.ess_bulk[name])
-        if not (ess := self.ess_bulk[fewest]) >= SAMPLING.ess:
-            found.append(f"bulk ESS of {fewest} is {ess:.0f}, below {SAMPLING.ess:.0f}: draw longer (--draws)")
+        if not (ess := self.ess_bulk[fewest]) >= LEAST_ESS:
+            found.append(f"bulk ESS of {fewest} is {ess:.0f}, below {LEAST_ESS:.0f}: draw longer (--draws)")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged: draw longer, or narrow the priors")
-        bad = np.flatnonzero(~(self.pareto_k <= SAMPLING.pareto_k))
+        bad = np.flatnonzero(~(self.pareto_k <= MOST_PARETO_K))
         if len(bad):
             names = ", ".join(self.particles[i] for i in bad[:5]) + (", ..." if len(bad) > 5 else "")
             found.append(
-                f"Pareto k is above {SAMPLING.pareto_k} for particle {names}: its likelihood is far from the quadratic "
+                f"Pareto k is above {MOST_PARETO_K} for particle {names}: its likelihood is far from the quadratic "
                 "that the fast mode takes it for; use --mode joint, or leave the particle out"
             )
-        if self.pareto_k_joint is not None and not self.pareto_k_joint <= SAMPLING.pareto_k:
+        if self.pareto_k_joint is not None and not self.pareto_k_joint <= MOST_PARETO_K:
             found.append(
-                f"Pareto k of all particles together is {self.pareto_k_joint:.2f}, above {SAMPLING.pareto_k}: "
+                f"Pareto k of all particles together is {self.pareto_k_joint:.2f}, above {MOST_PARETO_K}: "
                 "use --mode joint"
             )
         return found

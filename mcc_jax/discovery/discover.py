@@ -16,8 +16,7 @@ from ..calibrate import Model, Posterior, sample
 from ..calibrate.compiling import one_blas_thread
 from ..calibrate.data import root_mean_squares
 from ..calibrate.fitting import checked_settings
-from ..calibrate.judgement import numbers_in_reach, unlike_others
-from ..calibrate.settings import JUDGEMENT
+from ..calibrate.judgement import LEAST_LEFT, numbers_in_reach, unlike_others
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import named
 from ..campaign.force_zero import open_zero
@@ -241,7 +240,7 @@ def _settled_fit(
         left_out.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
         without = outlying.particles
     left = len(base.tests) - len({*snapping, *without})
-    if snapping and not base.coarse and left >= JUDGEMENT.left:
+    if snapping and not base.coarse and left >= LEAST_LEFT:
         text = f"{named(snapping, len(campaign))}: the law snaps through in its loading; it takes no part in the search"
         left_out.append(Finding("snap-through", "info", text, "", snapping))
         without = (*without, *(name for name in snapping if name not in without))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..calibrate.estimates import finite
-from ..calibrate.settings import JUDGEMENT
+from ..calibrate.judgement import LARGE_MISFIT
 from .evidence import LinearModel
 from .hypothesis import UNLISTED, Names
 from .search import Search
@@ -66,7 +66,7 @@ class HeldOut:
             middle = f"medians {np.median(before):.2g} um without it, {np.median(after):.2g} um with it"
             return f"{worse} of {len(after)} lie further from the law with it than without ({middle})"
         off = float(np.median(after / range_um))
-        if off > JUDGEMENT.misfit:
+        if off > LARGE_MISFIT:
             return f"the law with it still misses them by {100 * off:.2g} % of their range (median)"
         return None
 

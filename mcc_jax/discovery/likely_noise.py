@@ -8,9 +8,9 @@ from itertools import product
 import numpy as np
 
 from ..calibrate.data import ranges_um
+from ..calibrate.judgement import LARGE_MISFIT
 from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation, particle_scales
-from ..calibrate.settings import JUDGEMENT
 from .base import Base
 from .columns import Design, with_noise
 from .design import design_of
@@ -28,7 +28,7 @@ def with_other_noise(design: Design, hyper: np.ndarray, model: Model) -> Optimum
     start[3] = other.noise[0, 3]  # the length's unit may be another
     found = optimise(other, start, curvature=False)
     share = np.median(np.exp(found.hyper[2]) * design.scale / ranges_um(design.tests))
-    return found if share < JUDGEMENT.misfit else replace(found, log_evidence=-np.inf, log_joint=-np.inf)
+    return found if share < LARGE_MISFIT else replace(found, log_evidence=-np.inf, log_joint=-np.inf)
 
 
 def with_likely_noise(base: Base) -> tuple[Base, Optimum]:

@@ -14,8 +14,8 @@ from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
 from .._errors import InputError
 from ..calibrate import PaperCalibration
+from ..calibrate.data import UNLOADED_FROM
 from ..calibrate.paper.modulus import collapsed_branches
-from ..calibrate.settings import UNLOADED_FROM
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style

@@ -10,7 +10,8 @@ import numpy as np
 
 from .._format import number, percent
 from ..calibrate.curves import FittedCurve
-from ..calibrate.settings import JUDGEMENT, SAMPLING
+from ..calibrate.importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
+from ..calibrate.judgement import CORRELATED_SHARE, LARGE_MISFIT
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
 from ..discovery.sentences import headline, verdict_in_words, within_noise
@@ -59,11 +60,11 @@ CHECKS = {
         "Few particles say little of how particles differ. Why some are left out is said under The tests.",
     ),
     "Chains agree (R-hat)": (
-        f"at most {SAMPLING.rhat}",
+        f"at most {MOST_RHAT}",
         "Independent chains must agree. If not: more draws (--draws).",
     ),
     "Independent draws (bulk ESS)": (
-        f"at least {SAMPLING.ess:.0f}",
+        f"at least {LEAST_ESS:.0f}",
         "Number of independent draws that the chains are worth. If too few: more draws (--draws).",
     ),
     "Diverging trajectories": (
@@ -71,7 +72,7 @@ CHECKS = {
         "The sampler could not follow the posterior everywhere. If not 0: more draws, or narrower priors.",
     ),
     "Fast mode is accurate (Pareto k)": (
-        f"at most {SAMPLING.pareto_k}",
+        f"at most {MOST_PARETO_K}",
         "How well the quadratic summaries of the fast mode approximate the tests themselves. If not: --mode joint.",
     ),
     "The law's form fits": (
@@ -191,12 +192,12 @@ def _calibration(content: dict[str, Any]) -> list[Check]:
 def _sampler(d: dict[str, Any]) -> list[Check]:
     rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
     k = None if k is None else max(k, d.get("pareto_k_joint") or k)
-    few = _below(None if ess is None else -ess, -SAMPLING.ess, -ESS_BAD)
+    few = _below(None if ess is None else -ess, -LEAST_ESS, -ESS_BAD)
     return [
-        _check("Chains agree (R-hat)", _below(rhat, SAMPLING.rhat, RHAT_BAD), number(rhat)),
+        _check("Chains agree (R-hat)", _below(rhat, MOST_RHAT, RHAT_BAD), number(rhat)),
         _check("Independent draws (bulk ESS)", few, number(ess)),
         _check("Diverging trajectories", _below(divergences, 0.0, 0.0), number(divergences)),
-        _check("Fast mode is accurate (Pareto k)", _below(k, SAMPLING.pareto_k, PARETO_K_BAD), number(k, 2)),
+        _check("Fast mode is accurate (Pareto k)", _below(k, MOST_PARETO_K, PARETO_K_BAD), number(k, 2)),
     ]
 
 
@@ -214,10 +215,10 @@ def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Check]:
         misfit = _own_misfit(shown)
     found = []
     if misfit is not None and np.isfinite(misfit):
-        level = _below(misfit, GOOD_MISFIT, JUDGEMENT.misfit)
+        level = _below(misfit, GOOD_MISFIT, LARGE_MISFIT)
         found.append(_check("The law's form fits", level, f"off by {percent(misfit)}"))
     if noise is not None:
-        level = _below(noise, GOOD_NOISE_SHARE, JUDGEMENT.noise_share)
+        level = _below(noise, GOOD_NOISE_SHARE, CORRELATED_SHARE)
         found.append(_check("What is left is noise", level, f"{percent(noise)} is autocorrelated"))
     if falling is not None:
         level = "good" if falling <= NOT_MONOTONE else "look"

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from joint_cases import ELASTIC, KINDS, POINTS, dense, random_tests
 from scipy.stats import multivariate_normal
 
+from mcc_jax.calibrate.data import READING_UM
 from mcc_jax.calibrate.distributions import RecordNoise
 from mcc_jax.calibrate.noise import (
     Noise,
@@ -22,7 +23,6 @@ from mcc_jax.calibrate.noise import (
     whitening,
 )
 from mcc_jax.calibrate.priors import NoisePrior
-from mcc_jax.calibrate.settings import READING_UM
 from mcc_jax.calibrate.sharding import Blocks
 
 FOUR = (0.2, 0.3, 0.5, 0.3)

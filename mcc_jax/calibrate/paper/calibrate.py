@@ -26,11 +26,10 @@ from ...campaign import (
 from ...campaign.reasons import refusal
 from ...geometry import plastic_shape_factor
 from ...law import MccLaw, StrainScaling, Unloading
-from ..data import point_noise_um, rows_from_contact
-from ..estimates import NO_SAMPLER, estimate, finite, force_zero, misfit_note
-from ..judgement import judged, numbers_in_reach, unlike_others
+from ..data import MOST_POINTS, point_noise_um, rows_from_contact
+from ..estimates import NO_SAMPLER, estimate, finite, force_zero
+from ..judgement import judged, misfit_note, numbers_in_reach, unlike_others
 from ..results import Calibration
-from ..settings import MOST_POINTS
 from .loading import MasterCurve, PlasticFit, StrainTable, fit_population, master_curve, strain_table
 from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
 from .prediction import ParticleFit, predict_particles

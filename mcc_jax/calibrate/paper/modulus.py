@@ -13,7 +13,7 @@ from ..._format import described
 from ...campaign import Adjustment, Campaign, Curve, Segment, stress_and_strain
 from ...formulas import recovery
 from ...law import StrainScaling, Unloading
-from ..settings import UNLOADED_FROM
+from ..data import UNLOADED_FROM
 
 
 @dataclass(frozen=True)
