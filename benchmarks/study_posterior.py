@@ -28,7 +28,7 @@ import numpy as np
 from mcc_jax import HiddenEffect
 from mcc_jax.calibrate import LogNormalPrior, Model, NakagamiPrior, NormalPrior, Priors, sample
 from mcc_jax.calibrate.estimates import effect_numbers
-from mcc_jax.calibrate.prior_draws import prior_populations
+from mcc_jax.calibrate.priors import population_sites
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
 from mcc_jax.geometry import Particle
 from mcc_jax.law import Plastic
@@ -78,7 +78,7 @@ def draw_truth(seed: int, setting: str):
     diameters = PAPER_DIAMETERS_UM[chosen]
     particles = particle_batch(diameters)
     flatness = eqx.filter_vmap(lambda p: p.flatness)(particles)
-    drawn = prior_populations(np.random.default_rng([seed, 0]), 1, model, np.asarray(flatness))
+    drawn = population_sites(model, np.asarray(flatness), None, np.random.default_rng([seed, 0])).population
     p = jax.tree.map(lambda x: np.asarray(x)[0], drawn)
     tau = np.array([p.tau[0], COLLAPSED, p.tau[2]]) if setting == "collapsed" else p.tau
     truth = {"a": float(p.a), "effective_modulus_MPa": float(np.exp(p.log_modulus))}

@@ -21,7 +21,7 @@ from .noise import Whitening, forward_substitution
 from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
 from .predict import laws_with, predicted_at, predicted_by
-from .prior_draws import log_priors, prior_populations
+from .priors import population_sites
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -59,7 +59,8 @@ POINTS_DRAWS = 250  # per chain that are kept where every point has a likelihood
 def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
     """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
     flatness = np.asarray(calibration.fit.tests.flatness)
-    drawn = prior_populations(np.random.default_rng(seed), count, calibration.model, flatness)
+    rng = np.random.default_rng(seed)
+    drawn = population_sites(calibration.model, flatness, None, rng, count).population
     return _variables(jax.tree.map(lambda x: np.asarray(x)[None], drawn), calibration.model)
 
 
@@ -109,8 +110,8 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
         posterior["particle_modulus_MPa"] = c.modulus_MPa[:, thin]
     for name, place in c.model.varying_places.items():
         posterior[f"particle_{name}"] = c.theta[:, thin, :, place]
-    densities = log_priors(flattened(population), c.model, np.asarray(c.fit.tests.flatness))
-    prior_density = {name: values.reshape(chains, -1) for name, values in densities.items()}
+    sites = population_sites(c.model, np.asarray(c.fit.tests.flatness), flattened(population))
+    prior_density = {name: values.reshape(chains, -1) for name, values in sites.log_densities().items()}
     prior = prior_draws(c, prior_count, seed)
     shown, predicted, before = _predictive(c, prior, seed, thin if points else None)
     observed = np.where(mask, np.asarray(tests.displacement), np.nan)

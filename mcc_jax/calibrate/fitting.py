@@ -17,7 +17,6 @@ from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
 from .data import MOST_POINTS, Selection, Tests, longer, point_noise_um, select
-from .distributions import SpreadCoordinate
 from .fit_result import Fit, population_of
 from .forward import Point, linearise
 from .linearisation import Linearisation, start_of_effects
@@ -27,8 +26,7 @@ from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .particle_fit import STEPS, ParticleFits, fit_particles, linear_starts
 from .population import Population
-from .prior_draws import site_values
-from .priors import Priors, check_prior_of_a
+from .priors import Priors, SpreadCoordinate, check_prior_of_a, population_sites
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
@@ -150,7 +148,9 @@ class _Fitter:
         white = np.exp(np.asarray(start.noise.logs)[0]) * np.asarray(scale)
         self.individual = self.alone(white, point.theta, own[None])
         self.linear = self.linearisation.at(point)
-        return site_values(start.population, self.model, np.asarray(self.tests.flatness))
+        one = jax.tree.map(lambda x: np.asarray(x)[None], start.population)
+        values = population_sites(self.model, np.asarray(self.tests.flatness), one).values
+        return {name: float(value[0]) for name, value in values.items()}
 
     def begin(self, read_out_um: float) -> dict[str, float]:
         """Every particle on its own, and from which values of the model's sites to look for the population."""

@@ -17,7 +17,6 @@ from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .compiling import one_blas_thread
 from .data import Selection, Tests, ranges_um
-from .distributions import SpreadCoordinate, nuisance_moments
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
 from .fit_result import Fit
 from .fitting import beyond_numbers, checked_settings, prepare
@@ -26,6 +25,7 @@ from .hierarchical import SHARED, Parameters, Pooled, Solution, fit_pooled, unpa
 from .judgement import judged, numbers_in_reach, unlike_others
 from .model import Model
 from .population import COEFFICIENTS
+from .priors import SpreadCoordinate, nuisance_moments
 from .results import JointCalibration
 
 Loss = Literal["linear", "soft_l1", "cauchy"]

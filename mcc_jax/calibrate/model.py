@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float
+from numpyro.distributions import constraints
 
 from .. import arguments
 from .._errors import InputError
@@ -20,12 +23,11 @@ from .._types import Scalar
 from ..effects import Variant, find_variant
 from ..law import StrainScaling, Unloading
 from .data import Tests
-from .distributions import Amplitude, RecordNoise, SpreadCoordinate, nuisance_prior
 from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal
 from .noise import FREEDOM, Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
-from .priors import NakagamiPrior, Priors, bounds_of_a
+from .priors import Amplitude, NakagamiPrior, Priors, SpreadCoordinate, bounds_of_a, nuisance_prior
 
 sample: Any = numpyro.sample
 deterministic: Any = numpyro.deterministic
@@ -288,6 +290,36 @@ class Model:
         """
         new = tuple(_variant(one) for one in effects)
         return dataclasses.replace(self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying)))
+
+
+class RecordNoise(dist.Distribution):
+    """Displacements of whole tests around a prediction [um]: one event is one test, log likelihoods are by particle."""
+
+    arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
+    support: Any = constraints.real_vector
+
+    def __init__(self, loc: Float[Array, "particles points"], filters: Whitening, factor: Array) -> None:
+        self.loc, self.filters, self.factor = loc, filters, factor
+        super().__init__(batch_shape=loc.shape[:1], event_shape=loc.shape[1:])
+
+    def log_prob(self, value: Any, intermediates: Any = None) -> Any:
+        """Log density of every test; points that do not count carry nothing."""
+        away = jnp.where(self.filters.mask, value - self.loc, 0.0)
+        return jax.vmap(lambda f, one: f.log_density(one, jnp.log(self.factor)))(self.filters, away)
+
+    def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
+        """Draws; points that do not count are NaN, as ArviZ wants ragged data."""
+        count, points = self.loc.shape
+
+        def one(key: Any) -> Array:
+            white, of_branches, of_zero = (jax.random.normal(k, (count, points)) for k in jax.random.split(key, 3))
+            drawn = eqx.filter_vmap(lambda f, *normal: f.colour(*normal))(
+                self.filters, white, of_branches, of_zero[:, 0]
+            )
+            return jnp.where(self.filters.mask, self.loc + self.factor * drawn, jnp.nan)
+
+        keys = jax.random.split(key, math.prod(sample_shape))
+        return jax.vmap(one)(keys).reshape(*sample_shape, count, points)
 
 
 def spread(name: str, prior: NakagamiPrior) -> Scalar:

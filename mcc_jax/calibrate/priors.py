@@ -1,44 +1,44 @@
-"""What is believed before the data: weakly informative, in physical units, and open to change from a file."""
+"""Priors: what is believed before the data, as numbers, as distributions of NumPyro, and as draws and densities of the
+population."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from jaxtyping import Array, Float
+from numpyro.distributions import constraints
 
 from .. import arguments
 from .._errors import InputError
 from .._format import described
 from ..campaign import load_toml_file
+from ..effects import Nuisance, Variant
 from ..law import Unloading
+from .population import COEFFICIENTS, Population
 
+if TYPE_CHECKING:
+    from .model import Model
 
-class NoisePrior(eqx.Module):
-    """Log-normal priors of the four numbers of the noise: medians and standard deviations of the logarithm."""
-
-    median: Float[Array, " 4"]
-    log_sd: Float[Array, " 4"]
-
-    def log_density(self, logs: np.ndarray) -> np.ndarray:
-        """Log density of the logarithms; shape (..., 4) becomes (...)."""
-        sd = np.asarray(self.log_sd)
-        away = (logs - np.log(self.median)) / sd
-        return np.asarray(-0.5 * np.sum(away**2, -1) - np.sum(np.log(sd * np.sqrt(2 * np.pi))))
+ALMOST = 0.98  # share of the way to the value of a at which a particle's shape factor would vanish
+# Peak stress [MPa] and scaled strain there of the paper's tests, about: what the default priors belong to.
+CELLULOSE = 11.0, 0.6
+KNEE = 0.1  # share of its prior's scale above which a spread's coordinate is logarithmic
+SCALES = 4  # an amplitude's prior is an equal mixture of so many scales, from barely credible to the largest that is
 
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """A normal distribution.
-
-    Raises:
-        InputError: if the mean is not finite or the standard deviation not positive.
-    """
+    """A normal distribution; raises `InputError` if its standard deviation is not positive."""
 
     mean: float
     sd: float
@@ -50,11 +50,7 @@ class NormalPrior:
 
 @dataclass(frozen=True)
 class LogNormalPrior:
-    """A log-normal distribution: its median, and the standard deviation of the logarithm.
-
-    Raises:
-        InputError: if one of them is not positive.
-    """
+    """A log-normal distribution: its median, and the standard deviation of the logarithm, both positive."""
 
     median: float
     log_sd: float
@@ -86,15 +82,22 @@ class NakagamiPrior:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sd", arguments.number(self.sd, "the scale sd of a spread", above=0))
-        shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=MAX_SHAPE)
-        object.__setattr__(self, "shape", shape)
+        object.__setattr__(
+            self, "shape", arguments.number(self.shape, "the shape of a spread's prior", above=0, most=0.5)
+        )
 
 
-MAX_SHAPE = 0.5
-ALMOST = 0.98
-"""Share of the way to the value of a at which a particle's shape factor would vanish."""
-CELLULOSE = 11.0, 0.6
-"""Peak stress [MPa] and scaled strain there of the paper's tests, about: what the default priors belong to."""
+class NoisePrior(NamedTuple):
+    """Log-normal priors of the four parameters of the noise: medians and standard deviations of the logarithm."""
+
+    median: Float[Any, " 4"]
+    log_sd: Float[Any, " 4"]
+
+    def log_density(self, logs: np.ndarray) -> np.ndarray:
+        """Log density of the logarithms; shape (..., 4) becomes (...)."""
+        sd = np.asarray(self.log_sd)
+        away = (logs - np.log(self.median)) / sd
+        return np.asarray(-0.5 * np.sum(away**2, -1) - np.sum(np.log(sd * np.sqrt(2 * np.pi))))
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,6 @@ class Priors:
     noise_correlated_um: LogNormalPrior = LogNormalPrior(0.01, 1.5)
     noise_length: LogNormalPrior = LogNormalPrior(0.2, 1.0)
     noise_factor: LogNormalPrior = LogNormalPrior(1.0, 0.5)
-    changed: tuple[str, ...] = field(default=(), compare=False)
 
     __repr__ = described()
 
@@ -154,15 +156,10 @@ class Priors:
 
         Under a change of units of stress and strain the coefficients go as :math:`C_1 \sim \sigma/\epsilon`,
         :math:`C_5 \sim \sigma^{1/5}/\epsilon` and the modulus as :math:`\sigma/\epsilon^3` (printed form) or
-        :math:`\sigma/\epsilon^{3/2}` (punch forms), so medians move with the median peak; widths are twice those for
-        cellulose, since a shape of curve that is known for one material is a guess for another. The length of
-        correlated noise is held near its median: noise that hangs together over several branches is a curve of every
-        test's own, which would describe any test.
-
-        Args:
-            stress_MPa: at the median test's peak.
-            strain: at the same peak.
-            unloading: form of unloading.
+        :math:`\sigma/\epsilon^{3/2}` (punch forms), so medians move with stress and strain at the median test's peak;
+        widths are twice those for cellulose, since a shape of curve that is known for one material is a guess for
+        another. The length of correlated noise stays near its median: noise that is correlated over several branches
+        would describe any test.
         """
         base = cls.default(unloading)
         up, along = stress_MPa / CELLULOSE[0], strain / CELLULOSE[1]
@@ -196,17 +193,15 @@ class Priors:
     def noise(self) -> NoisePrior:
         """The four priors of the noise together."""
         four = (self.noise_displacement_um, self.noise_force_mN, self.noise_correlated_um, self.noise_length)
-        return NoisePrior(jnp.asarray([p.median for p in four]), jnp.asarray([p.log_sd for p in four]))
+        return NoisePrior(np.array([p.median for p in four]), np.array([p.log_sd for p in four]))
 
     def to_json(self) -> dict[str, Any]:
         """Every prior with its numbers."""
-        content = {}
-        for name, prior in self._entries():
-            content[name] = {"distribution": _NAMES[type(prior)], **dataclasses.asdict(prior)}
-        return content
-
-    def _entries(self) -> list[tuple[str, Any]]:
-        return [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "changed"]
+        names = {NormalPrior: "normal", LogNormalPrior: "log-normal", NakagamiPrior: "nakagami"}
+        return {
+            name: {"distribution": names[type(prior)], **dataclasses.asdict(prior)}
+            for name, prior in vars(self).items()
+        }
 
 
 def bounds_of_a(flatness: Any) -> tuple[Any, Any]:
@@ -215,11 +210,7 @@ def bounds_of_a(flatness: Any) -> tuple[Any, Any]:
 
 
 def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
-    """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
-
-    Raises:
-        InputError: if it does not.
-    """
+    """Raise `InputError` if the prior of `a` leaves no value under which every particle's shape factor is positive."""
     low, high = bounds_of_a(flatness)
     if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
         raise InputError(
@@ -227,9 +218,6 @@ def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
             f"factor is positive ({low:.3g} < a < {high:.3g})",
             remedy="Widen the prior, or check the diameters.",
         )
-
-
-_NAMES = {NormalPrior: "normal", LogNormalPrior: "log-normal", NakagamiPrior: "nakagami"}
 
 
 def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
@@ -246,24 +234,212 @@ def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED
     """
     file = arguments.file_path(file, "file")
     priors = Priors.default(unloading)
-    known = dict(priors._entries())
+    known = vars(priors)
     changes: dict[str, Any] = {}
-    content = load_toml_file(file, "a TOML file of priors")
-    for name, entry in content.items():
+    for name, entry in load_toml_file(file, "a TOML file of priors").items():
         if name not in known:
-            raise InputError(
-                f"there is no prior {name!r}", file=file, remedy=f"Known priors: {', '.join(sorted(known))}."
-            )
-        fields = [f.name for f in dataclasses.fields(known[name])]
-        if not isinstance(entry, dict) or not set(entry) <= set(fields):
-            wrong = (
-                "must be a table" if not isinstance(entry, dict) else f"has no entry {min(set(entry) - set(fields))!r}"
-            )
-            remedy = f"Write [{name}] and its {', '.join(fields)}."
-            raise InputError(f"prior {name!r} {wrong}", file=file, remedy=remedy)
+            remedy = f"Known priors: {', '.join(sorted(known))}."
+            raise InputError(f"there is no prior {name!r}", file=file, remedy=remedy)
+        remedy = f"Write [{name}] and its {', '.join(vars(known[name]))}."
+        if not isinstance(entry, dict):
+            raise InputError(f"prior {name!r} must be a table", file=file, remedy=remedy)
+        if strange := sorted(set(entry) - set(vars(known[name]))):
+            raise InputError(f"prior {name!r} has no entry {strange[0]!r}", file=file, remedy=remedy)
         try:
             numbers = {key: arguments.number(value, f"{name}.{key}") for key, value in entry.items()}
             changes[name] = dataclasses.replace(known[name], **numbers)
         except InputError as error:
             raise InputError(error.problem, file=file, column=name, remedy="Correct the entry.") from None
-    return dataclasses.replace(priors, **changes, changed=tuple(changes))
+    return dataclasses.replace(priors, **changes)
+
+
+# ---- distributions that NumPyro does not have ------------------------------------------------------------------------
+
+
+def numpy_of(x: Any) -> Any:
+    """NumPy of NumPy's arrays and plain numbers, which then compile nothing; JAX's of its own."""
+    return jnp if isinstance(x, jax.Array) else np
+
+
+class SpreadCoordinate(dist.Distribution):
+    r"""The coordinate x of a spread :math:`\tau = k s \sinh^p |x|`, p = 1/(2m), whose prior is Nakagami's.
+
+    It may have either sign: the density is even and smooth at 0, so that a spread that is 0 is no boundary and has no
+    tail towards minus infinity. Of :math:`\tau^{2m-1}` and :math:`d\tau/dx` only cosh x is left.
+    """
+
+    arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
+    support: Any = constraints.real
+
+    def __init__(self, prior: NakagamiPrior) -> None:
+        self.prior, self.power = prior, 1 / (2 * prior.shape)
+        super().__init__(batch_shape=(), event_shape=())
+
+    @property
+    def unit(self) -> float:
+        """The spread where sinh |x| is 1."""
+        return KNEE * self.prior.sd
+
+    @property
+    def constant(self) -> float:
+        """The log density at 0."""
+        m, s = self.prior.shape, self.prior.sd
+        return -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(self.unit) + math.log(self.power)
+
+    def spread(self, coordinate: Any) -> Any:
+        """The spread at a coordinate."""
+        xp = numpy_of(coordinate)
+        return self.unit * xp.sinh(xp.abs(coordinate)) ** self.power
+
+    def coordinate(self, spread: Any) -> Any:
+        """The coordinate, >= 0, of a spread."""
+        return numpy_of(spread).arcsinh((spread / self.unit) ** (1 / self.power))
+
+    def log_prob(self, value: Any, intermediates: Any = None) -> Any:
+        """Log density of the coordinate."""
+        xp, spread = numpy_of(value), self.spread(value) / self.prior.sd
+        return self.constant - 0.5 * spread**2 + xp.log(xp.cosh(value))
+
+    logpdf = log_prob  # as SciPy has it
+
+    def rvs(self, size: int, random_state: np.random.Generator) -> np.ndarray:
+        """Draws of the coordinate, >= 0, by NumPy."""
+        return self.coordinate(self.prior.sd * np.sqrt(2 * random_state.gamma(self.prior.shape, size=size)))
+
+    def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
+        """Draws of the coordinate."""
+        size, sign = jax.random.split(key)
+        tau = self.prior.sd * jnp.sqrt(2 * jax.random.gamma(size, self.prior.shape, sample_shape))
+        x = self.coordinate(tau)
+        return jnp.where(jax.random.bernoulli(sign, 0.5, sample_shape), x, -x)
+
+
+class Amplitude(dist.Distribution):
+    """The amplitude of an effect in units of the smallest plausible one, along its physical sign.
+
+    An equal mixture of half-normal distributions, of normal ones where both signs are physical, whose scales are spread
+    evenly in the logarithm from the smallest to the largest plausible amplitude.
+    """
+
+    arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
+
+    def __init__(self, variant: Variant) -> None:
+        low, high = variant.plausible
+        self.scales = np.geomspace(1.0, high / low, SCALES)
+        self.both = variant.sign == 0
+        super().__init__(batch_shape=(), event_shape=())
+
+    @property
+    def support(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Softplus keeps the coordinate linear where the amplitude is more than barely plausible."""
+        return constraints.real if self.both else constraints.softplus_positive
+
+    def log_prob(self, value: Any, intermediates: Any = None) -> Any:
+        """Log density."""
+        each = [-0.5 * (value / s) ** 2 - math.log(s * math.sqrt(2 * math.pi)) for s in self.scales.tolist()]
+        total = reduce(numpy_of(value).logaddexp, each) - math.log(SCALES)
+        return total if self.both else total + math.log(2)
+
+    logpdf = log_prob  # as SciPy has it
+
+    def rvs(self, size: int, random_state: np.random.Generator) -> np.ndarray:
+        """Draws by NumPy."""
+        drawn = random_state.choice(self.scales, size) * random_state.standard_normal(size)
+        return drawn if self.both else np.abs(drawn)
+
+    def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
+        """Draws."""
+        which, size = jax.random.split(key)
+        scale = jnp.asarray(self.scales)[jax.random.randint(which, sample_shape, 0, SCALES)]
+        drawn = scale * jax.random.normal(size, sample_shape)
+        return drawn if self.both else jnp.abs(drawn)
+
+
+def nuisance_moments(nuisance: Nuisance) -> tuple[float, float]:
+    """Prior mean and standard deviation of a further number of a formula, of its logarithm if it must be positive."""
+    low, high = nuisance.plausible
+    if low > 0:
+        low, high = math.log(low), math.log(high)
+    return (low + high) / 2, (high - low) / 4
+
+
+def nuisance_prior(nuisance: Nuisance) -> dist.Distribution:
+    """A further number of a formula: normal in the logarithm over its plausible range, or on it if it may be 0."""
+    low, high = nuisance.plausible
+    if low > 0:
+        return dist.LogNormal(*nuisance_moments(nuisance))
+    return dist.TruncatedNormal(*nuisance_moments(nuisance), low=low, high=high)
+
+
+# ---- the population's prior by NumPy, which compiles nothing ---------------------------------------------------------
+
+
+class Sites(NamedTuple):
+    """A prior and values of every sampled site of `Model.population`, by name, and the populations of these values."""
+
+    priors: dict[str, Any]
+    values: dict[str, np.ndarray]
+    population: Population
+
+    def log_densities(self) -> dict[str, np.ndarray]:
+        """Log density of the prior of every site at its values."""
+        return {name: prior.logpdf(self.values[name]) for name, prior in self.priors.items()}
+
+
+def population_sites(
+    model: Model, flatness: np.ndarray, known: Population | None, rng: np.random.Generator | None = None, count: int = 1
+) -> Sites:
+    """The sites at known populations, every field with a leading axis, or else at draws from the prior.
+
+    Of the coordinates of a known spread it is the positive one.
+    """
+    from scipy.stats import lognorm, norm, truncnorm  # slow to import, so only where it is used
+
+    prior, priors, values = model.chosen_priors, {}, {}
+
+    def site(name: str, prior: Any, of: Callable[[Population], Any]) -> np.ndarray:
+        priors[name] = prior
+        values[name] = prior.rvs(size=count, random_state=rng) if known is None else np.asarray(of(known))
+        return values[name]
+
+    def truncated(mean: float, sd: float, low: float, high: float) -> Any:
+        return truncnorm((low - mean) / sd, (high - mean) / sd, mean, sd)
+
+    def spread(name: str, prior: Any, of: Callable[[Population], Any]) -> Any:
+        one = SpreadCoordinate(prior)
+        return one.spread(site(f"{name}_coordinate", one, lambda p: one.coordinate(np.asarray(of(p)))))
+
+    a = site("a", truncated(prior.a.mean, prior.a.sd, *bounds_of_a(flatness)), lambda p: p.a)
+    modulus, factor, softening = prior.effective_modulus_MPa, prior.noise_factor, prior.softening
+    log_modulus = site("log_modulus", norm(np.log(modulus.median), modulus.log_sd), lambda p: p.log_modulus)
+    shift = np.log1p(a[:, None] * flatness).mean(-1)
+    b1 = site("b1", norm(np.log(prior.C1.median) + shift, prior.C1.log_sd), lambda p: p.mu[:, 0] + shift)
+    b5 = site("b5", norm(np.log(prior.C5.median) + shift, prior.C5.log_sd), lambda p: p.mu[:, 2] + shift)
+    middle = (np.log(20 / 9 * softening.median) + b1 + 5 * b5) / 6
+    b3 = site("b3", norm(middle, softening.log_sd / 6), lambda p: p.mu[:, 1] + shift)
+    tau = [
+        spread(f"tau_{n}", getattr(prior, f"tau_{n}"), lambda p, j=j: p.tau[:, j]) for j, n in enumerate(COEFFICIENTS)
+    ]
+    scatters = [
+        spread(name, getattr(prior, name), lambda p, n=name: getattr(p, n))
+        if getattr(model, name)
+        else np.zeros_like(a)
+        for name in ("modulus_scatter", "shape_scatter")
+    ]
+    theta, further, own = [], [], []
+    for v in model.effects:
+        unit, k = (v.sign or 1) * v.plausible[0], len(theta)
+        theta.append(unit * site(f"{v.mechanism}_size", Amplitude(v), lambda p, k=k, unit=unit: p.theta[:, k] / unit))
+        for n in v.nuisances:
+            mean, sd = nuisance_moments(n)
+            law = lognorm(sd, scale=np.exp(mean)) if n.plausible[0] > 0 else truncated(mean, sd, *n.plausible)
+            place = len(model.effects) + len(further)
+            further.append(site(f"{v.mechanism}.{n.name}", law, lambda p, k=place: p.theta[:, k]))
+        if v.mechanism in model.varying:
+            j = len(own)
+            own.append(spread(f"tau_{v.mechanism}", model.spread_prior(v), lambda p, j=j: p.theta_scatter[:, j]))
+    log_noise = site("log_noise_factor", norm(np.log(factor.median), factor.log_sd), lambda p: p.log_noise)
+    mu, tau = np.stack([b1, b3, b5], -1) - shift[:, None], np.stack(tau, -1)
+    numbers, spreads = (np.reshape(x, (-1, len(a))).T for x in (theta + further, own))
+    fields = (a, log_modulus, mu, tau, *scatters, log_noise, numbers, spreads)
+    return Sites(priors, values, jax.vmap(lambda one: Population(*one))(fields))

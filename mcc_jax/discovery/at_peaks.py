@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..calibrate.distributions import nuisance_moments
 from ..calibrate.forward import Forms
+from ..calibrate.priors import nuisance_moments
 from ..effects.record import Record
 from ..geometry import Particle
 from .base import Base

@@ -15,11 +15,11 @@ from jaxtyping import Array, Float
 
 from .._types import Progress
 from ..calibrate.data import Selection, Tests, longer, ranges_um, root_mean_squares
-from ..calibrate.distributions import SpreadCoordinate
 from ..calibrate.fitting import in_own_units, prepare
 from ..calibrate.forward import Forms, Point, snap
 from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.model import Model
+from ..calibrate.priors import SpreadCoordinate
 from ..calibrate.sharding import Blocks, Parts
 from ..campaign import Campaign, find_segments
 from .settings import DECISIONS

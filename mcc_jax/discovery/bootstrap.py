@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from ..calibrate.distributions import SCALES
+from ..calibrate.priors import SCALES
 from .columns import with_amplitudes
 from .evidence import LinearModel, marginalise
 from .screen import single_integrals

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..calibrate.compiling import compiled
-from ..calibrate.distributions import nuisance_moments
 from ..calibrate.forward import Forms, Linear, Point, linearise
+from ..calibrate.priors import nuisance_moments
 from ..effects import Variant
 from .base import Base, State
 from .columns import Design, Kinds, prior_of_noise

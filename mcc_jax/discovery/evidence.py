@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import log_ndtr
 
-from ..calibrate.distributions import SCALES, SpreadCoordinate
+from ..calibrate.priors import SCALES, SpreadCoordinate
 from .columns import LOG_2PI, Columns, Design, with_amplitudes
 from .settings import LENGTH_FACTORS, NOISE_FACTORS, STRONG
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibrate.distributions import SpreadCoordinate
-from ..calibrate.priors import NakagamiPrior
+from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..effects import Mechanism
 from .base import Base
 from .columns import Design, without_further

@@ -15,8 +15,8 @@ from scipy.special import log_ndtr, logsumexp
 
 from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
-from ..calibrate.distributions import SCALES
 from ..calibrate.forward import Forms, Point
+from ..calibrate.priors import SCALES
 from ..effects import AbstractEffect, Mechanism
 from ..law import signatures
 from .base import Base, State

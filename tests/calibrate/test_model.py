@@ -19,13 +19,11 @@ from scipy.stats import kstest, lognorm, nakagami, norm
 
 from mcc_jax import InputError, Model, Priors, Programme
 from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
-from mcc_jax.calibrate.distributions import Amplitude, SpreadCoordinate, nuisance_prior
 from mcc_jax.calibrate.fit_result import population_of
 from mcc_jax.calibrate.forward import Point
 from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, populations, seeded
 from mcc_jax.calibrate.noise import standard_promotion
-from mcc_jax.calibrate.prior_draws import log_priors
-from mcc_jax.calibrate.priors import check_prior_of_a
+from mcc_jax.calibrate.priors import Amplitude, SpreadCoordinate, check_prior_of_a, nuisance_prior, population_sites
 from mcc_jax.effects import LIBRARY, find_variant
 
 EFFECTS = Model().with_effects("creep:logarithmic", "unloading_shape:symmetric_bow", varying="creep")
@@ -208,7 +206,7 @@ def values_at(free, target):
 
 
 def test_the_density_is_priors_times_likelihood_times_volume(target, density):
-    """Priors of the sites as `log_priors` has them; the volume is that of the map from unbounded coordinates."""
+    """Priors of the sites as `population_sites` has them; the volume is that of the map from unbounded coordinates."""
 
     @eqx.filter_jit
     def parts(free):
@@ -223,7 +221,8 @@ def test_the_density_is_priors_times_likelihood_times_volume(target, density):
         free = jnp.asarray(0.7 * rng.standard_normal(len(target.names)))
         jacobian, population, expected = parts(free)
         one = jax.tree.map(lambda x: np.asarray(x)[None], population)
-        expected += sum(v[0] for v in log_priors(one, target.model, np.asarray(target.marginal.flatness)).values())
+        sites = population_sites(target.model, np.asarray(target.marginal.flatness), one)
+        expected += sum(v[0] for v in sites.log_densities().values())
         expected += np.linalg.slogdet(np.asarray(jacobian))[1]
         np.testing.assert_allclose(float(density(free)[0]), expected, rtol=1e-9)
 

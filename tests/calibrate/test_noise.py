@@ -13,7 +13,7 @@ from joint_cases import ELASTIC, KINDS, POINTS, dense, random_tests
 from scipy.stats import multivariate_normal
 
 from mcc_jax.calibrate.data import READING_UM
-from mcc_jax.calibrate.distributions import RecordNoise
+from mcc_jax.calibrate.model import RecordNoise
 from mcc_jax.calibrate.noise import (
     Noise,
     Whitening,

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
 from mcc_jax import Model, log_evidence
-from mcc_jax.calibrate.distributions import SCALES, nuisance_moments
+from mcc_jax.calibrate.priors import SCALES, nuisance_moments
 from mcc_jax.discovery.design import ExtraColumns, between, design_of, moved
 from mcc_jax.discovery.evidence import (
     LinearModel,

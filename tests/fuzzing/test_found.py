@@ -66,7 +66,7 @@ def test_many_empty_lines_behind_the_samples(tmp_path):
 def test_toml(tmp_path, text, words):
     (tmp_path / "p.toml").write_text(text, encoding="utf-8")
     if words is None:
-        assert read_priors(tmp_path / "p.toml").changed == ("a",)
+        assert read_priors(tmp_path / "p.toml").a.mean in (1.0, -(2.0**63))
     else:
         assert words in refused(read_priors, tmp_path / "p.toml")
 
