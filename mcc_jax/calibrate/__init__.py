@@ -7,10 +7,10 @@ from .data import select_tests as select_tests
 from .evidence import compare as compare
 from .evidence import fit as fit
 from .evidence import log_evidence as log_evidence
-from .fit_result import Fit as Fit
 from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
 from .many_campaigns import calibrate_many as calibrate_many
+from .mode import Fit as Fit
 from .model import Model as Model
 from .paper.calibrate import PaperCalibration as PaperCalibration
 from .paper.calibrate import calibrate_paper as calibrate_paper

@@ -12,9 +12,8 @@ from jaxtyping import Array
 
 from .compiling import compiled
 from .estimates import effect_numbers
-from .fit_result import Fit
 from .importance import diagnostics, sample_weighted
-from .mode import LogPosterior, log_densities, populations
+from .mode import Fit, LogPosterior, log_densities, populations
 from .model import Model
 from .noise import standard_promotion
 from .particles import PROBES, Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted

@@ -13,10 +13,10 @@ from .._format import described
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .compiling import one_blas_thread
-from .fit_result import Fit
 from .fitting import checked_settings, prepare
 from .importance import smoothed
 from .judgement import numbers_in_reach
+from .mode import Fit
 from .model import Model
 from .posterior import Posterior, sample
 

@@ -17,11 +17,10 @@ from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
 from .data import MOST_POINTS, Selection, Tests, longer, point_noise_um, select
-from .fit_result import Fit, population_of
 from .forward import Point, linearise
 from .linearisation import Linearisation, start_of_effects
 from .marginal import Marginal, summarise
-from .mode import LogPosterior, careful_enough, expect, log_densities, most_probable
+from .mode import Fit, LogPosterior, careful_enough, expect, log_densities, most_probable, population_of
 from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .particle_fit import STEPS, ParticleFits, fit_particles, linear_starts

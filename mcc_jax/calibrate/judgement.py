@@ -18,7 +18,7 @@ from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.findings import named
 from ..campaign.plausibility import add_likely_unit_error
-from .fit_result import Fit
+from .mode import Fit
 
 MODULUS_OPEN = "unknown modulus"
 """The `check` of the finding that the tests leave the modulus open."""

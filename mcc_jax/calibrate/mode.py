@@ -1,11 +1,10 @@
 """The population in coordinates without bounds, given the tests with every particle integrated out: its density, its
-mode, the particles that it expects."""
+mode, the particles that it expects; and the fit at that mode, from which samplers start."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -13,15 +12,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
+import numpyro.distributions as dist
 import numpyro.handlers
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 
+from .._format import table, with_sd
 from .._types import Scalar
+from ..arguments import is_traced
 from .compiling import compiled, side_by_side
+from .data import Tests
+from .forward import Point
 from .marginal import Marginal, straighten
 from .model import Model
-from .noise import standard_promotion
+from .noise import NoiseFit, Whitening, standard_promotion
+from .particle_fit import ParticleFits
 from .population import Population
 
 handlers: Any = numpyro.handlers
@@ -33,10 +38,13 @@ DENSITIES, DENSITIES_AT_ONCE = 250, 10  # coordinates in one call, and side by s
 DIFFERENCE = 0.02  # step of differences, in sd: rounding and the series' next term are below 1e-4 of the curvature
 MODE_GAIN = 1e-6  # twice the log probability still to gain, by Newton's method, at which the mode is reached
 ATTEMPTS = 4  # how often the search for the mode begins again where it stopped
+# Acceptance that NUTS aims at. Where spreads are small the density of the population parameters is narrow (a funnel),
+# and with fewer than some ten particles the usual 0.8 lets trajectories diverge there.
+ACCEPT = 0.99
 
 
 def seeded(model: Any) -> Any:
-    """A NumPyro model that may ask for random numbers, all of which are given."""
+    """A NumPyro model that may ask for random numbers, all of whose sites are given."""
     return handlers.seed(model, jax.random.key(0))
 
 
@@ -112,11 +120,8 @@ def _unconstrained(values: Float[Array, " d"], target: LogPosterior) -> Float[Ar
 
 
 class Expected(eqx.Module):
-    """What a population says of its particles, and what the tests add.
-
-    `mean` and `sd` of b1, b3, b5, e, and `theta_mean` and `theta_sd` of the amplitudes that vary, are those under the
-    population; `latent`, `theta` and `zero` [um] the most probable ones given the tests; the rest is that of `Laplace`.
-    """
+    """The particles' `mean` and `sd` of b1, b3, b5, e, `theta_mean` and `theta_sd` of the amplitudes that vary, under a
+    population; their most probable `latent`, `theta` and `zero` [um] given the tests; the rest as in `Laplace`."""
 
     mean: Float[Array, "particles 4"]
     sd: Float[Array, "particles 4"]
@@ -157,16 +162,20 @@ def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
 
 
 def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
-    """The target with as many Newton steps as the integration over the particles needs.
-
-    None are needed if every coefficient of the first `count` particles, those that are no padding, is known sharply.
-    """
+    """The target without Newton steps in the integration over the particles, if every coefficient of the first `count`
+    of them, those that are no padding, is known sharply; else as it is."""
     scatter = replace(target.marginal.scatter, newton=0)
     sharp = replace(target, marginal=replace(target.marginal, scatter=scatter))
     at = expect(free, sharp)
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
     return sharp if widest < SHARP else target
+
+
+@compiled
+def population_of(free: Float[Array, " d"], target: LogPosterior) -> Population:
+    """The population at unbounded coordinates."""
+    return target.population(free)
 
 
 @compiled
@@ -187,12 +196,10 @@ def _log_densities(free: Float[Array, "rows d"], count: Int[Array, ""], target: 
 
 
 def log_densities(free: np.ndarray, target: LogPosterior) -> np.ndarray:
-    """Log density of the population at many coordinates, shape (many, d).
-
-    Compiled for `DENSITIES` at a time, so that few and many of them share their compilation; on two threads.
-    """
+    """Log density of the population at many coordinates, shape (many, d), on two threads."""
 
     def some(rows: np.ndarray) -> np.ndarray:
+        # Always of one size, so that few and many of them share their compilation.
         filled = jnp.asarray(np.pad(rows, ((0, DENSITIES - len(rows)), (0, 0)), mode="edge"))
         return np.asarray(_log_densities(filled, jnp.asarray(np.asarray(len(rows))), target))[: len(rows)]
 
@@ -209,27 +216,25 @@ def most_probable(
     has no curvature that is a number, even at the start, the covariance is not one either.
     """
     origin = np.asarray(start)
-    d = len(origin)
-    width = np.full(d, 1e-5)
-
-    def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        return expanded(free, width, target)
-
-    # Where data are very exact the scales at the start are far from those at the mode: then again from there.
+    width = np.full(len(origin), 1e-5)
+    value, slope, curvature = expanded(origin, width, target)
+    if not all(np.isfinite(part).all() for part in (value, slope, curvature)):
+        return jnp.asarray(origin), jnp.asarray(np.full_like(curvature, np.nan)), False
     success = False
-    if not all(np.isfinite(part).all() for part in expand(origin)):
-        return jnp.asarray(origin), jnp.asarray(np.full((d, d), np.nan)), False
-    for _ in range(ATTEMPTS):
-        unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
+    # Where data are very exact the scales at the start are far from those at the mode: then again from there.
+    for attempt in range(ATTEMPTS):
+        if attempt:
+            _, _, curvature = expanded(origin, width, target)
+        unit = _scales(curvature)
         width = DIFFERENCE * np.minimum(unit, 1.0)
-        found = _newton(expand, origin, unit)
+        found = _newton(origin, unit, width, target)
         origin = origin + unit * found.x
         success = bool(found.success)
         if success:
             break
-    _, slope, curvature = expand(origin)
+    _, slope, curvature = expanded(origin, width, target)
     # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
-    scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
+    scale = _scales(curvature)
     values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
     convex = bool(np.all(values > 1e-7))
     values = np.where(values > 1e-7, values, 0.01)
@@ -237,6 +242,11 @@ def most_probable(
     # Rounding may keep the optimiser from its tolerance at the very mode: what counts is what is left to gain.
     there = convex and float(slope @ covariance @ slope) < MODE_GAIN
     return jnp.asarray(origin), jnp.asarray(covariance), success or there
+
+
+def _scales(curvature: np.ndarray) -> np.ndarray:
+    """Standard deviation of each coordinate by itself."""
+    return 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
 
 
 def expanded(free: np.ndarray, width: np.ndarray, target: LogPosterior) -> tuple[float, np.ndarray, np.ndarray]:
@@ -255,27 +265,141 @@ def expanded(free: np.ndarray, width: np.ndarray, target: LogPosterior) -> tuple
     return float(here), (up - down) / (2 * width), curvature
 
 
-def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):
+def _newton(origin: np.ndarray, unit: np.ndarray, width: np.ndarray, target: LogPosterior) -> Any:
+    """SciPy's minimum from the origin on, in steps of these units."""
     from scipy.optimize import minimize
 
-    memory: dict[bytes, tuple[float, np.ndarray, np.ndarray]] = {}
-
-    def at(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        key = z.tobytes()
-        if key not in memory:
-            memory.clear()
-            found = expand(origin + unit * z)
-            # A step may lead to where spreads overflow: then it is refused, for which SciPy wants finite derivatives.
-            if not all(np.isfinite(part).all() for part in found):
-                found = (np.inf, np.zeros_like(origin), np.eye(len(origin)))
-            memory[key] = found
-        return memory[key]
+    @lru_cache(maxsize=1)  # value, gradient and curvature are asked for one after the other
+    def at(z: bytes) -> tuple[float, np.ndarray, np.ndarray]:
+        found = expanded(origin + unit * np.frombuffer(z), width, target)
+        # A step may lead to where spreads overflow: then it is refused, for which SciPy wants finite derivatives.
+        if not all(np.isfinite(part).all() for part in found):
+            return np.inf, np.zeros_like(origin), np.eye(len(origin))
+        return found
 
     return minimize(
-        lambda z: at(z)[0],
+        lambda z: at(z.tobytes())[0],
         np.zeros_like(origin),
-        jac=lambda z: at(z)[1] * unit,
-        hess=lambda z: at(z)[2] * unit * unit[:, None],
+        jac=lambda z: at(z.tobytes())[1] * unit,
+        hess=lambda z: at(z.tobytes())[2] * unit * unit[:, None],
         method="trust-exact",
         options={"gtol": 1e-4, "maxiter": 200},
     )
+
+
+# ---- the fit at the mode ---------------------------------------------------------------------------------------------
+
+
+class Fit(eqx.Module):
+    """Particles, noise and population of a campaign in agreement.
+
+    Attributes:
+        model: what was assumed.
+        tests: the measurements.
+        individual: every particle on its own.
+        noise: the campaign's noise.
+        filters: its filters at the point.
+        point: most probable numbers of every particle.
+        residual: measured less predicted displacement there [um], 0 where masked.
+        marginal: the tests there, with every particle's own numbers integrated out.
+        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
+        converged: for particles, noise and population in turn.
+    """
+
+    model: Model = eqx.field(static=True)
+    tests: Tests
+    individual: ParticleFits
+    noise: NoiseFit
+    filters: Whitening
+    point: Point
+    residual: Float[Array, "particles points"]
+    marginal: Marginal
+    mode: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    converged: Bool[np.ndarray, " 3"]
+
+    def __repr__(self) -> str:
+        if is_traced(self.mode):
+            return "Fit while JAX traces it"
+        sd = np.sqrt(np.diag(np.asarray(self.covariance)))
+        numbers = zip(self.names, np.asarray(self.mode), sd, strict=True)
+        rows = [(name, with_sd({"value": float(value), "sd": float(s)})) for name, value, s in numbers]
+        state = "converged" if self.converged.all() else "NOT converged"
+        effects = ", ".join(variant.label for variant in self.model.effects) or "no effects"
+        return table(f"Fit of {len(self.tests)} particles, {effects}, {state}; in unbounded coordinates", rows)
+
+    @property
+    def target(self) -> LogPosterior:
+        """The density of the population given all tests, in unbounded coordinates."""
+        return LogPosterior(self.model, self.marginal)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return self.target.names
+
+    @property
+    def population(self) -> Population:
+        """The most probable population."""
+        return population_of(self.mode, self.target)
+
+    def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
+        """NumPyro's NUTS for the model, from the mode on, in coordinates in which the covariance there is the identity.
+
+        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
+        every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
+        they mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`.
+
+        Args:
+            explicit: sample every particle's own numbers.
+            settings: of `numpyro.infer.NUTS`.
+        """
+        from numpyro.infer import NUTS, init_to_value
+
+        size = len(self.names) + explicit * len(self.tests) * (self.marginal.scatter.size + 1)
+        start = init_to_value(values={"coordinates": jnp.zeros(size)})
+        return NUTS(FitCoordinates(self, size), **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
+
+    def first(self, count: int) -> Fit:
+        """The same of the first `count` particles: without padding."""
+
+        def some(tree: Any) -> Any:
+            return jax.tree.map(lambda x: x[:count], tree)
+
+        marginal = replace(some(replace(self.marginal, weight=None)), scatter=self.marginal.scatter)
+        noise = replace(self.noise.noise, scale=self.noise.noise.scale[:count])
+        return replace(
+            self,
+            tests=some(replace(self.tests, weight=None)),
+            individual=some(self.individual),
+            noise=replace(self.noise, noise=noise),
+            filters=some(self.filters),
+            point=some(self.point),
+            residual=self.residual[:count],
+            marginal=marginal,
+        )
+
+
+class FitCoordinates:
+    """The model in the coordinates of a fit, as a NumPyro model: its density, written in numbers that are near standard
+    normal, since widths that span five powers of ten do not mix; every site of the model is a `deterministic`."""
+
+    def __init__(self, fit: Fit, size: int) -> None:
+        self.fit, self.size = fit, size
+
+    def __call__(self, tests: Tests, marginal: Marginal | None = None) -> None:
+        """As `Model`: with `marginal` every particle is integrated out, else its own numbers are explicit."""
+        fit, improper = self.fit, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
+        position: Any = numpyro.sample("coordinates", improper)
+        d = len(fit.names)
+        free = fit.mode + jnp.linalg.cholesky(fit.covariance) @ position[:d]
+        sites = fit.target.sites(free)
+        options = {} if marginal is not None else {"filters": fit.filters, "around": fit.marginal}
+        if marginal is None:
+            sites["own"] = position[d:].reshape(len(tests), -1)
+        with handlers.block():  # the model is evaluated here, and adds no sites of its own
+            potential: Any = potential_energy(fit.model, (tests, marginal), options, sites)
+            values = constrain_fn(seeded(fit.model), (tests, marginal), options, sites, return_deterministic=True)
+        numpyro.factor("density", -potential)
+        for name, value in values.items():
+            numpyro.deterministic(name, value)

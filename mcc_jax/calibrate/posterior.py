@@ -17,10 +17,10 @@ from .compiling import imported_meanwhile, one_blas_thread
 from .data import Selection, ranges_um
 from .draws import Draws, draw_fast, draw_joint, named_population
 from .estimates import effect_entries, finite, summary
-from .fit_result import Fit
 from .fitting import Start, checked_settings, prepare
 from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
 from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
+from .mode import Fit
 from .model import Model
 from .particles import Length
 from .population import COEFFICIENTS

@@ -22,9 +22,9 @@ from ..law import MccLaw
 from .curves import FittedCurve, fitted_curves
 from .data import Selection, compared_rows, ranges_um, root_mean_squares
 from .estimates import estimate, finite, force_zero, log_estimate
-from .fit_result import Fit
 from .judgement import misfit_note, noise_note, noise_share
 from .laws import law_of
+from .mode import Fit
 from .model import Model
 from .population import COEFFICIENTS, Population
 from .summary import quantities, summary_table

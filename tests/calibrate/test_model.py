@@ -19,9 +19,8 @@ from scipy.stats import kstest, lognorm, nakagami, norm
 
 from mcc_jax import InputError, Model, Priors, Programme
 from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
-from mcc_jax.calibrate.fit_result import population_of
 from mcc_jax.calibrate.forward import Point
-from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, populations, seeded
+from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, population_of, populations, seeded
 from mcc_jax.calibrate.noise import standard_promotion
 from mcc_jax.calibrate.priors import Amplitude, SpreadCoordinate, check_prior_of_a, nuisance_prior, population_sites
 from mcc_jax.effects import LIBRARY, find_variant
