@@ -1,7 +1,5 @@
 """From a campaign to the law's parameters."""
 
-from .arviz import to_arviz as to_arviz
-from .arviz import write_posterior as write_posterior
 from .curves import FittedCurve as FittedCurve
 from .data import select_tests as select_tests
 from .evidence import compare as compare

@@ -1,8 +1,8 @@
-"""The posterior as ArviZ data, and the file it is kept in."""
+"""The posterior as ArviZ data; see `Posterior.to_arviz`."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import arguments
-from .._extras import extra
 from ..law import MccLaw
 from .compiling import compiled
 from .data import Tests
@@ -19,12 +18,13 @@ from .draws import named_population
 from .model import Model
 from .noise import Whitening, forward_substitution
 from .population import COEFFICIENTS, Population, flattened
-from .posterior import Posterior
 from .predict import laws_with, predicted_at, predicted_by
 from .priors import population_sites
 
 if TYPE_CHECKING:
     from xarray import DataTree
+
+    from .posterior import Posterior
 
 VARIABLES: dict[str, tuple[str, list[str]]] = {
     "a": ("1", []),
@@ -72,50 +72,31 @@ def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
     return {"mu": mu, "tau": np.asarray(p.tau)} | medians | named
 
 
-def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
-    """The posterior as an ArviZ `DataTree`.
-
-    Groups: `posterior` (population, effects and every particle), `log_likelihood`, `log_prior` (by site), `prior`,
-    `prior_predictive` and `posterior_predictive` (displacement at the measured forces), `sample_stats` (`lp_test`),
-    `observed_data`, `constant_data`. Every variable has its unit in its attributes.
-
-    `log_likelihood` holds the variable `test`: each particle's whole test given the population, the particle integrated
-    out, so that ArviZ's `loo` leaves one *particle* out. With `points` it holds `displacement_um` instead, the density
-    of every reading given those before it and its particle's own numbers, along the dimension `observation`, which
-    observed data and predictions then share; draws are thinned.
-
-    Args:
-        calibration: the posterior.
-        prior_count: draws from the prior.
-        points: likelihoods by reading.
-        seed: random seed of prior and predictive draws.
-    """
+def data_tree(c: Posterior, prior_count: int, points: bool, seed: int) -> DataTree:
+    """What `Posterior.to_arviz` gives."""
     from arviz_base import from_dict
 
-    prior_count = arguments.whole(prior_count, "prior_count", least=1)
-    seed = arguments.seed(seed)
-    points = arguments.flag(points, "points")
-    c, tests = calibration, calibration.selection.tests
-    particles, mask = list(c.particles), np.asarray(tests.mask)
-    chains, draws = np.asarray(c.population.a).shape
-    thin = slice(None, None, -(-draws // POINTS_DRAWS) if points else 1)
-    population = jax.tree.map(lambda x: np.asarray(x)[:, thin], c.population)
-    posterior: dict[str, Any] = _variables(population, c.model) | {
-        "yield_stress_MPa": c.yield_stress_MPa()[:, thin],
-        "C": c.C[:, thin],
-        "zero_um": c.zero_um[:, thin],
-        "eta_p": c.shape_factor[:, thin],
+    prior = prior_draws(c, arguments.whole(prior_count, "prior_count", least=1), arguments.seed(seed))
+    if points:
+        every = -(-c.C.shape[1] // POINTS_DRAWS)
+        names = ("population", "C", "modulus_MPa", "zero_um", "shape_factor", "theta", "log_likelihood")
+        thinned = {name: jax.tree.map(lambda x: np.asarray(x)[:, ::every], getattr(c, name)) for name in names}
+        c = replace(c, **thinned)
+    tests, particles, mask = c.selection.tests, list(c.particles), np.asarray(c.selection.tests.mask)
+    posterior: dict[str, Any] = _variables(c.population, c.model) | {
+        "yield_stress_MPa": c.yield_stress_MPa(),
+        "C": c.C,
+        "zero_um": c.zero_um,
+        "eta_p": c.shape_factor,
     }
     if c.model.modulus_scatter:
-        posterior["particle_modulus_MPa"] = c.modulus_MPa[:, thin]
-    for name, place in c.model.varying_places.items():
-        posterior[f"particle_{name}"] = c.theta[:, thin, :, place]
-    sites = population_sites(c.model, np.asarray(c.fit.tests.flatness), flattened(population))
-    prior_density = {name: values.reshape(chains, -1) for name, values in sites.log_densities().items()}
-    prior = prior_draws(c, prior_count, seed)
-    shown, predicted, before = _predictive(c, prior, seed, thin if points else None)
+        posterior["particle_modulus_MPa"] = c.modulus_MPa
+    posterior |= {f"particle_{name}": c.theta[..., k] for name, k in c.model.varying_places.items()}
+    sites = population_sites(c.model, np.asarray(c.fit.tests.flatness), flattened(c.population))
+    prior_density = {name: values.reshape(len(c.C), -1) for name, values in sites.log_densities().items()}
+    shown, predicted, before = _predictive(c, prior, seed, everything=points)
     observed = np.where(mask, np.asarray(tests.displacement), np.nan)
-    likelihood: dict[str, Any] = {"test": c.log_likelihood[:, thin]}
+    likelihood: dict[str, Any] = {"test": c.log_likelihood}
     dims = {name: dimensions for name, (_, dimensions) in VARIABLES.items() if dimensions}
     dims |= {f"particle_{name}": ["particle"] for name in c.model.varying_places}
     coords: dict[str, Any] = {
@@ -126,7 +107,7 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
     }
     some = coords | {"particle": particles[:shown]}
     if points:
-        likelihood = {"displacement_um": _point_likelihoods(c, thin)[..., mask]}
+        likelihood = {"displacement_um": _point_likelihoods(c)[..., mask]}
         observed, dims["displacement_um"] = observed[mask], ["observation"]
         coords["observation"], some["observation"] = np.arange(mask.sum()), np.arange(mask[:shown].sum())
         predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
@@ -141,7 +122,7 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
         "posterior": posterior,
         "log_likelihood": likelihood,
         "log_prior": prior_density,
-        "sample_stats": {"lp_test": c.log_likelihood[:, thin].sum(-1)},
+        "sample_stats": {"lp_test": c.log_likelihood.sum(-1)},
         "prior": prior,
         "observed_data": {"displacement_um": observed},
         "constant_data": constant,
@@ -178,45 +159,40 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
 
 
 def _predictive(
-    c: Posterior, prior: dict[str, np.ndarray], seed: int, thin: slice | None
+    c: Posterior, prior: dict[str, np.ndarray], seed: int, *, everything: bool
 ) -> tuple[int, np.ndarray, np.ndarray]:
     """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked.
 
-    Of the posterior either draws and particles enough for a picture, or, thinned, the draws that likelihoods belong to.
+    Of the posterior either draws and particles enough for a picture, or everything.
     """
     mask = np.asarray(c.selection.tests.mask)
-    chains, draws = np.asarray(c.population.a).shape
-    points = mask.shape[1]
-    shown = len(mask)
-    if thin is None:
+    chains, draws = c.C.shape[:2]
+    shown, points = mask.shape
+    pick = np.arange(chains * draws).reshape(chains, draws)
+    if not everything:
         shown = max(1, min(shown, POINTS // (chains * CURVES * points)))
-        thin = slice(None, None, -(-draws // CURVES))
-    pick = np.arange(chains * draws).reshape(chains, draws)[:, thin]
+        pick = pick[:, :: -(-draws // CURVES)]
     predicted = np.full((*pick.shape, shown, points), np.nan, np.float32)
     before = np.full((1, CURVES, shown, points), np.nan, np.float32)
     for row in range(shown):
-        curves = predicted_at(c, row, pick.ravel(), seed + row)
-        assert curves.observed_um is not None
-        length = curves.observed_um.shape[1]
-        shaped = curves.observed_um.reshape(*pick.shape, length)
-        predicted[:, :, row, :length] = np.where(mask[row, :length], shaped, np.nan)
+        curves = predicted_at(c, row, pick.ravel(), seed + row).observed_um
+        assert curves is not None
+        length = curves.shape[1]
+        predicted[:, :, row, :length] = np.where(mask[row, :length], curves.reshape(*pick.shape, length), np.nan)
         before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, CURVES, seed), np.nan)
     return shown, predicted, before
 
 
-def _point_likelihoods(c: Posterior, thin: slice) -> np.ndarray:
+def _point_likelihoods(c: Posterior) -> np.ndarray:
     """Log density of every reading given those before it and its particle's own numbers, shape (chain, draw, N, n)."""
-    tests, filters = c.fit.tests, c.fit.filters
-    C, a = c.C[:, thin], np.asarray(c.population.a)[:, thin]
-    modulus, zero, theta = c.modulus_MPa[:, thin], c.zero_um[:, thin], c.theta[:, thin]
-    factor = np.exp(np.asarray(c.population.log_noise)[:, thin]).reshape(-1)
+    a, log_noise = (flattened(np.asarray(x)) for x in (c.population.a, c.population.log_noise))
     found = []
     for row in range(len(c.particles)):
-        own_C, own_modulus, own_theta, own_zero = flattened(tuple(x[:, :, row] for x in (C, modulus, theta, zero)))
-        laws = laws_with(c.model, own_C, a.reshape(-1), own_modulus, own_theta)
-        test, noise = jax.tree.map(lambda x, r=row: x[r], (tests, filters))
-        found.append(np.asarray(_one_ahead(laws, jnp.asarray(own_zero), jnp.asarray(factor), test, noise)))
-    return np.stack(found, 1).reshape(*a.shape, len(c.particles), -1)
+        C, modulus, theta, zero = flattened(tuple(x[:, :, row] for x in (c.C, c.modulus_MPa, c.theta, c.zero_um)))
+        laws = laws_with(c.model, C, a, modulus, theta)
+        test, noise = jax.tree.map(lambda x, r=row: x[r], (c.fit.tests, c.fit.filters))
+        found.append(np.asarray(_one_ahead(laws, jnp.asarray(zero), jnp.asarray(np.exp(log_noise)), test, noise)))
+    return np.stack(found, 1).reshape(*c.C.shape[:3], -1)
 
 
 @compiled
@@ -239,24 +215,9 @@ def _prior_curves(c: Posterior, prior: dict[str, np.ndarray], row: int, count: i
     rng = np.random.default_rng([seed, row])
     pick = rng.integers(prior["a"].shape[1], size=count)
     C = np.exp(prior["mu"][0, pick] + prior["tau"][0, pick] * rng.standard_normal((count, 3)))
-    theta = np.zeros((count, len(c.model.forms.names)))
-    for k, name in enumerate(c.model.forms.names):
-        theta[:, k] = prior[name][0, pick]
+    theta = np.reshape([prior[name][0, pick] for name in c.model.forms.names], (-1, count)).T
     laws = laws_with(c.model, C, prior["a"][0, pick], prior["effective_modulus_MPa"][0, pick], theta)
     test = jax.tree.map(lambda x: x[row], c.fit.tests)
     clean = np.asarray(predicted_by(laws, test.particle, test.record))
     zero = c.model.chosen_priors.zero_um
     return clean + float(test.contact) + zero.mean + zero.sd * rng.standard_normal((count, 1))
-
-
-def write_posterior(calibration: Posterior, file: str | Path) -> None:
-    """Write `posterior.nc` (NetCDF 4), readable by `arviz.from_netcdf` and `xarray.open_datatree`.
-
-    Of several processes, which all have the same posterior, only the first one writes.
-    """
-    file = arguments.file_path(file, "file")
-    with extra("netcdf"):
-        import h5netcdf  # noqa: F401
-        import h5py  # noqa: F401
-    if jax.process_index() == 0:
-        to_arviz(calibration, seed=calibration.seed).to_netcdf(file, engine="h5netcdf")

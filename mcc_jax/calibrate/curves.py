@@ -17,7 +17,7 @@ from ..geometry import Particle
 from ..law import MccLaw
 from .compiling import compiled
 from .data import MOST_POINTS, padded_length, records_of, rows_from_contact
-from .laws import Variants, laws_of
+from .estimates import Variants, laws_of
 from .population import COEFFICIENTS
 
 KINDS = ("load", "hold", "unload", "reload")

@@ -1,8 +1,7 @@
-"""The draws behind the posterior: the population's, every particle drawn back, weights applied, diagnostics."""
+"""The draws of a posterior by the names of its attributes: population, particles drawn back, weights, diagnostics."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -25,58 +24,13 @@ from .sharding import count_of
 FALLBACK_ACCEPT, TREE_DEPTH = 0.95, 5
 
 
-@dataclass(frozen=True, kw_only=True)
-class Draws:
-    """Draws of population and particles, and how good they are; axes (chain, draw, ...).
-
-    Attributes:
-        population: draws of the population.
-        C: draws of every particle's C1, C3, C5, shape (chains, draws, N, 3).
-        modulus_MPa: of its effective modulus.
-        zero_um: of its zero.
-        shape_factor: of its eta_p.
-        theta: of the numbers of its effects, in the order of `model.forms.names`.
-        log_likelihood: of its whole test under each draw of the population, the particle integrated out: what
-            leave-one-particle-out needs.
-        pareto_k: of every particle's importance weights.
-        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
-            has them; None where they were not formed.
-        weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
-            population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
-        divergences: number of divergent trajectories.
-        rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
-        log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
-            approximation alone).
-        notes: what a reader must know.
-    """
-
-    population: Population
-    C: np.ndarray
-    modulus_MPa: np.ndarray
-    zero_um: np.ndarray
-    shape_factor: np.ndarray
-    theta: np.ndarray
-    log_likelihood: np.ndarray
-    pareto_k: np.ndarray
-    pareto_k_joint: float | None
-    weights_applied: bool
-    divergences: int
-    rhat: dict[str, float]
-    ess_bulk: dict[str, float]
-    ess_tail: dict[str, float]
-    leapfrogs: float
-    log_evidence: tuple[float, float] = (np.nan, np.inf)
-    notes: tuple[str, ...] = ()
-
-
 def exact_likelihood(fit: Fit) -> ExactLikelihood:
     """The tests of a fit with their exact likelihood."""
     mean, sd = fit.model.zero_prior
     return ExactLikelihood(fit.tests, fit.filters, fit.marginal, (mean, sd), fit.model.forms)
 
 
-def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: bool = True) -> Draws:
+def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: bool) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights.
 
     Without `fallback`, and where the fit did not converge, NUTS never runs, which takes minutes there: the draws are
@@ -95,12 +49,14 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: boo
         parameters = _stack(run.population, fit, length)[1].reshape(length.total, -1)
         found = corrected(drawer, run.population, parameters, length, check_key, pick_key, particle_key)
     run = run._replace(population=every(run.population, found.chosen))
-    drawn = _collected(run, found.particles[:4], fit, length, found.keep)
-    k_joint = found.k_joint if good else np.inf
     value = integral + found.log_ratio[0] + float(fit.noise.log_evidence)
-    evidence = value, float(np.hypot(error, found.log_ratio[1]))
-    checked = {"pareto_k": found.k, "pareto_k_joint": k_joint, "weights_applied": few}
-    return replace(drawn, **checked, log_evidence=evidence, notes=found.notes)
+    return _collected(run, found.particles[:4], fit, length, found.keep) | {
+        "pareto_k": found.k,
+        "pareto_k_joint": found.k_joint if good else np.inf,
+        "weights_applied": few,
+        "log_evidence": (value, float(np.hypot(error, found.log_ratio[1]))),
+        "notes": found.notes,
+    }
 
 
 class Run(NamedTuple):
@@ -112,11 +68,8 @@ class Run(NamedTuple):
 
 
 def _sampled(key: Array, fit: Fit, length: Length, many: bool, fallback: bool) -> tuple[Run, bool, tuple[float, float]]:
-    """Draws of the population: independent ones, weighted, if the weights are good enough, else NUTS's.
-
-    And whether they are good (without `fallback` NUTS does not run), and the log of the density's integral with its
-    standard error, by Laplace's method where NUTS drew.
-    """
+    """Draws of the population, independent and weighted if the weights are good enough, else NUTS's; whether they are
+    good; and the log of the density's integral with its standard error, by Laplace's method where NUTS drew."""
     target = fit.target
     shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
     found = sample_weighted(key, fit.mode, fit.covariance, target, **shape)
@@ -170,7 +123,7 @@ def _sample_density(
         return jax.vmap(chain)(keys)
 
 
-def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
+def draw_joint(key: Array, fit: Fit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
     from numpyro.infer import MCMC
 
@@ -188,7 +141,8 @@ def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
     sites = {name: jnp.asarray(samples[name]) for name in (*fit.names, "own")}
     population, particles = jax.tree.map(np.asarray, _explicit(sites, fit.target))
     run = Run(population, int(np.sum(extra["diverging"])), float(np.mean(extra["num_steps"])))
-    return _collected(run, particles, fit, length)
+    unweighted = {"pareto_k": np.zeros(len(fit.tests)), "pareto_k_joint": None, "weights_applied": False}
+    return _collected(run, particles, fit, length) | unweighted
 
 
 @compiled
@@ -203,38 +157,35 @@ def _explicit(sites: dict[str, Array], target: LogPosterior) -> tuple[Population
     return jax.lax.map(one, sites)
 
 
-def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1) -> Draws:
-    """What the results of both modes have in common; of the population every `keep`-th draw of each chain."""
+def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1) -> dict[str, Any]:
+    """What the draws of both modes have in common; of the population every `keep`-th draw of each chain."""
 
     def shaped(x: Any) -> np.ndarray:
         return np.asarray(x).reshape(length.chains, length.draws, *x.shape[1:])[:, ::keep]
 
-    population = jax.tree.map(shaped, run.population)
-    rhat, bulk, tail = diagnostics(*_stack(run.population, fit, length))
     count = count_of(fit.tests)
-    latent, theta, zero, likelihood = (np.asarray(v) for v in particles)
-    flatness = np.asarray(fit.marginal.flatness)[:count]
-    eta = 1 + np.asarray(population.a)[..., None] * flatness
-    latent = latent.reshape(length.chains, -1, count, 4)
+    population = jax.tree.map(shaped, run.population)
+    eta = 1 + np.asarray(population.a)[..., None] * np.asarray(fit.marginal.flatness)[:count]
     log_eta = np.log(eta)
-    return Draws(
-        population=population,
-        # What scatter of `a` there is has gone into b alone; a particle's coefficients are those under the common a.
-        C=np.exp(latent[..., :3] - log_eta[..., None]),
-        modulus_MPa=np.exp(latent[..., 3] - fit.model.shape_power * log_eta),
-        zero_um=zero.reshape(length.chains, -1, count),
-        shape_factor=eta,
-        theta=theta.reshape(length.chains, len(theta) // length.chains, count, theta.shape[-1]),
-        log_likelihood=likelihood.reshape(length.chains, -1, count),
-        pareto_k=np.zeros(count),
-        pareto_k_joint=None,
-        weights_applied=False,
-        divergences=run.divergences,
-        rhat=rhat,
-        ess_bulk=bulk,
-        ess_tail=tail,
-        leapfrogs=run.leapfrogs,
+    latent, theta, zero, likelihood = (
+        np.reshape(x, (length.chains, len(x) // length.chains, count, *x.shape[2:])) for x in map(np.asarray, particles)
     )
+    rhat, bulk, tail = diagnostics(*_stack(run.population, fit, length))
+    return {
+        "population": population,
+        # What scatter of `a` there is has gone into b alone; a particle's coefficients are those under the common a.
+        "C": np.exp(latent[..., :3] - log_eta[..., None]),
+        "modulus_MPa": np.exp(latent[..., 3] - fit.model.shape_power * log_eta),
+        "zero_um": zero,
+        "shape_factor": eta,
+        "theta": theta,
+        "log_likelihood": likelihood,
+        "divergences": run.divergences,
+        "rhat": rhat,
+        "ess_bulk": bulk,
+        "ess_tail": tail,
+        "leapfrogs": run.leapfrogs,
+    }
 
 
 def coordinates_of(population: Population, model: Model) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import jax
@@ -16,12 +17,12 @@ from .._format import described
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .compiling import one_blas_thread
-from .data import Selection, Tests, ranges_um
+from .data import Selection, Tests
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
 from .fitting import beyond_numbers, checked_settings, prepare
 from .forward import residuals
 from .hierarchical import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
-from .judgement import judged, numbers_in_reach, unlike_others
+from .judgement import numbers_in_reach
 from .mode import Fit
 from .model import Model
 from .population import COEFFICIENTS
@@ -143,7 +144,8 @@ class LeastSquares(JointCalibration):
             "effective_modulus_MPa": log_estimate(values[1], sds[1]),
         }
 
-    def to_json(self) -> dict[str, Any]:
+    @cached_property
+    def content(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         tests = self.selection.tests
         point = unpack(self.solution.value, self.settings, tests)
@@ -182,7 +184,7 @@ class LeastSquares(JointCalibration):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
-            "effects": effect_entries(self.model, self._effects(), estimates=True),
+            "effects": effect_entries(self.model, self._effects()),
             "loss": self.loss,
             **{
                 f"log_{name}": {
@@ -352,16 +354,14 @@ def least_squares(
         identifiability(best, (*SHARED, *model.forms.names)),
         (agree, len(starts)),
         seed,
-        time.perf_counter() - started,
+        runtime_s=0.0,
     )
-    outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(selection.tests))
 
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed}
         return least_squares(some, model, without_flagged=False, **settings).answer()
 
-    findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
+    return calibration.judged(started, again if without_flagged else None)
 
 
 def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:

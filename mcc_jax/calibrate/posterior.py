@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -13,25 +14,29 @@ from .. import arguments
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..campaign.findings import worst
+from .arviz import data_tree
 from .compiling import imported_meanwhile, one_blas_thread
-from .data import Selection, ranges_um
-from .draws import Draws, draw_fast, draw_joint, named_population
-from .estimates import effect_entries, finite, summary
+from .data import Selection
+from .draws import draw_fast, draw_joint, named_population
+from .estimates import effect_entries, effect_numbers, finite, summary
 from .fitting import Start, checked_settings, prepare
 from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
-from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
+from .judgement import at_noise_level, numbers_in_reach
 from .mode import Fit
 from .model import Model
 from .particles import Length
-from .population import COEFFICIENTS
+from .population import COEFFICIENTS, Population
 from .predict import predict_measured
-from .results import PosteriorDraws
+from .results import JointCalibration
+
+if TYPE_CHECKING:
+    from xarray import DataTree
 
 Mode = Literal["fast", "joint"]
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class Posterior(PosteriorDraws, Draws):
+class Posterior(JointCalibration):
     """The posterior of a campaign.
 
     Draws have the axes (chain, draw, ...); where importance weights were needed they have been applied, in order within
@@ -44,9 +49,25 @@ class Posterior(PosteriorDraws, Draws):
         fit: the joint fit it started from.
         mode: "fast" or "joint".
         seed, runtime_s: for the record.
-        findings: what a reader must know of the tests and of the plausibility of the answer.
-
-    The others are those of `Draws`.
+        population: draws of the population.
+        C: draws of every particle's C1, C3, C5, shape (chains, draws, N, 3).
+        modulus_MPa: of its effective modulus.
+        zero_um: of its displacement offset.
+        shape_factor: of its eta_p.
+        theta: of the parameters of its effects, in the order of `model.forms.names`.
+        log_likelihood: of its whole test under each draw of the population, the particle integrated out: what
+            leave-one-particle-out needs.
+        pareto_k: of every particle's importance weights.
+        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
+            has them; None where they were not formed.
+        weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
+            population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
+        divergences: number of divergent trajectories.
+        rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
+        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
+        log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
+            approximation alone).
+        findings, notes: what a reader must know of the tests, of the plausibility of the answer, and of the draws.
     """
 
     campaign: Campaign
@@ -56,7 +77,24 @@ class Posterior(PosteriorDraws, Draws):
     mode: Mode
     seed: int
     runtime_s: float
-    findings: tuple[Finding, ...] = field(default=())
+    population: Population
+    C: np.ndarray
+    modulus_MPa: np.ndarray
+    zero_um: np.ndarray
+    shape_factor: np.ndarray
+    theta: np.ndarray
+    log_likelihood: np.ndarray
+    pareto_k: np.ndarray
+    pareto_k_joint: float | None
+    weights_applied: bool
+    divergences: int
+    rhat: dict[str, float]
+    ess_bulk: dict[str, float]
+    ess_tail: dict[str, float]
+    leapfrogs: float
+    log_evidence: tuple[float, float] = (np.nan, np.inf)
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def predictions(self, particle: str) -> np.ndarray | None:
         """Draws of what may be measured of a particle at its rows [um], shape (draws, rows)."""
@@ -64,9 +102,9 @@ class Posterior(PosteriorDraws, Draws):
 
     def failures(self) -> list[str]:
         """Why the result must not be called converged, and what to do; empty if all gates are passed."""
-        reasons = ("noise", "population")
-        unfitted = [r for r, fine in zip(reasons, np.asarray(self.fit.converged)[1:], strict=True) if not fine]
-        if unfitted and self.mode == "fast":  # of what was drawn around a fit that is none, no diagnostic says anything
+        parts = zip(("noise", "population"), self.fit.converged[1:], strict=True)
+        unfitted = [part for part, fine in parts if not fine]
+        if unfitted and self.mode == "fast":  # diagnostics of draws around a fit that is none mean nothing
             by, what = self._missed, " and ".join(unfitted)
             if at_noise_level(self.fit, self.rms_um()):
                 return [
@@ -78,11 +116,11 @@ class Posterior(PosteriorDraws, Draws):
                 "out the particles that are unlike the others, or look for what is missing (discover)"
             ]
         found = []
-        slowest = max(self.rhat, key=lambda name: self.rhat[name])
-        if not (rhat := self.rhat[slowest]) <= MOST_RHAT:
+        slowest, rhat = max(self.rhat.items(), key=lambda item: item[1])
+        if not rhat <= MOST_RHAT:
             found.append(f"R-hat of {slowest} is {rhat:.3f}, above {MOST_RHAT}: draw longer (--draws)")
-        fewest = min(self.ess_bulk, key=lambda name: self.ess_bulk[name])
-        if not (ess := self.ess_bulk[fewest]) >= LEAST_ESS:
+        fewest, ess = min(self.ess_bulk.items(), key=lambda item: item[1])
+        if not ess >= LEAST_ESS:
             found.append(f"bulk ESS of {fewest} is {ess:.0f}, below {LEAST_ESS:.0f}: draw longer (--draws)")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged: draw longer, or narrow the priors")
@@ -126,16 +164,35 @@ class Posterior(PosteriorDraws, Draws):
 
     def probability_not_monotone(self) -> np.ndarray:
         """Share of a new particle's laws that are not monotone, one number per draw of the population."""
+        from scipy.special import ndtr
+
         mu, tau = np.asarray(self.population.mu), np.asarray(self.population.tau)
         gap = np.log(20 / 9) + mu[..., 0] + 5 * mu[..., 2] - 6 * mu[..., 1]
         spread = np.sqrt(tau[..., 0] ** 2 + 25 * tau[..., 2] ** 2 + 36 * tau[..., 1] ** 2)
-        from scipy.special import ndtr
-
         return ndtr(-gap / np.maximum(spread, 1e-12))
 
     def yield_stress_MPa(self) -> np.ndarray:
         r""":math:`\sigma_y = E[C_1]/17.16` [MPa] (eq. 22), one number per draw of the population."""
         return np.exp(np.asarray(self.population.mu)[..., 0] + np.asarray(self.population.tau)[..., 0] ** 2 / 2) / 17.16
+
+    def to_arviz(self, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
+        """The posterior as an ArviZ `DataTree`; its `to_netcdf(file)` writes it.
+
+        Groups: `posterior` (population, effects and every particle), `log_likelihood`, `log_prior` (by site), `prior`,
+        `prior_predictive` and `posterior_predictive` (displacement at the measured forces), `sample_stats` (`lp_test`),
+        `observed_data`, `constant_data`. Every variable has its unit in its attributes.
+
+        `log_likelihood` has the variable `test`: each particle's whole test given the population, the particle
+        integrated out, so that ArviZ's `loo` leaves one *particle* out. With `points` it has `displacement_um` instead,
+        the density of every reading given those before it and its particle's random effects, along the dimension
+        `observation`, which observed data and predictions then share; draws are thinned.
+
+        Args:
+            prior_count: draws from the prior.
+            points: likelihoods by reading.
+            seed: random seed of prior and predictive draws.
+        """
+        return data_tree(self, prior_count, points, seed)
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a, the modulus and the population, as in `calibration.json`."""
@@ -150,9 +207,11 @@ class Posterior(PosteriorDraws, Draws):
             },
         }
 
-    def to_json(self) -> dict[str, Any]:
+    @cached_property
+    def content(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         named = self.named_population()
+        effects = {name: summary(draws) for name, draws in effect_numbers(self.population, self.model).items()}
 
         def numbers(row: int) -> dict[str, Any]:
             found = {"eta_p": summary(self.shape_factor[..., row])}
@@ -173,7 +232,7 @@ class Posterior(PosteriorDraws, Draws):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
-            "effects": effect_entries(self.model, named),
+            "effects": effect_entries(self.model, effects),
             "modulus_scatter": summary(named["modulus_scatter"]) if self.model.modulus_scatter else None,
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),
@@ -220,12 +279,11 @@ def sample(
 
     The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough: see
     `importance`. Of many particles (more than 400,000 draws of single ones) the exact likelihood enters by
-    regression, and at most four million draws of single particles are kept: see `particles`.
+    regression, and at most four million draws of single particles are stored: see `particles`.
 
-    The particles are worked on in blocks, which spread over all devices of the process and, once
-    `jax.distributed.initialize` has been called, over all processes: every one of them then calls this function with
-    the same campaign and settings, and gets the result of one process. Over several devices of one process the fits are
-    the same to about 1e-9 and the draws are other draws of the same posterior.
+    Blocks of particles are distributed over all devices of the process and, once `jax.distributed.initialize` has been
+    called, over all processes: each of them then calls this function with the same arguments, and gets the result of
+    one process. Over several devices of one process the fits agree to about 1e-9, and the draws are others.
 
     Args:
         campaign: the tests.
@@ -233,16 +291,16 @@ def sample(
         threshold_MPa: points below this stress on loading do not count [MPa].
         mode: "fast" integrates the particles out through quadratic summaries of their tests and corrects by exact
             importance weights; "joint" samples everything at once under the exact likelihood, the reference.
-        chains: how many, each from random numbers of its own.
-        warmup: steps of each that tune NUTS, where it runs, and are thrown away.
-        draws: of each that are kept.
+        chains: how many, each from its own random numbers.
+        warmup: steps of each that tune NUTS, where it runs, and are discarded.
+        draws: of each that are returned.
         seed: random seed.
-        start: where the fit begins, for one: what `fit` gave of the same campaign and model.
+        without_flagged: where single particles are flagged, calibrate again without them and report that answer, too.
+        start: where the fit begins: what `fit` gave of the same campaign and model.
         progress: called with the name of each step.
 
     Raises:
-        InputError: if no particle can be used, or processes were given different campaigns; for an argument of the
-            wrong kind or out of its range.
+        InputError: if no particle can be used, or processes were given different campaigns.
     """
     started = time.perf_counter()
     imported_meanwhile("scipy.stats", "arviz_stats.base.array")
@@ -257,28 +315,20 @@ def sample(
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
         selection, fit, size = prepare(campaign, model, threshold_MPa, start=begin, progress=progress)
         progress("sampling the population" if fast else "sampling everything")
-        key = jax.random.key(seed)
-        likely = worst(check_plausibility(campaign)) != "error"
-        kept = fit.first(len(selection.kept))
-        drawn = draw_fast(key, fit, length, size, fallback=likely) if fast else draw_joint(key, kept, length)
+        key, kept = jax.random.key(seed), fit.first(len(selection.kept))
+        if fast:
+            plausible = worst(check_plausibility(campaign)) != "error"
+            drawn = draw_fast(key, fit, length, size, fallback=plausible)
+        else:
+            drawn = draw_joint(key, kept, length)
     progress("diagnosing")
-    calibration = Posterior(
-        campaign=campaign,
-        selection=selection,
-        model=fit.model,
-        fit=kept,
-        mode=mode,
-        seed=seed,
-        runtime_s=time.perf_counter() - started,
-        **{f.name: getattr(drawn, f.name) for f in fields(Draws)},
+    settings: dict[str, Any] = {"mode": mode, "seed": seed}
+    found = Posterior(
+        campaign=campaign, selection=selection, model=fit.model, fit=kept, runtime_s=0.0, **settings, **drawn
     )
-    tests = calibration.selection.tests
-    outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(tests))
 
     def again(some: Campaign) -> dict[str, Any]:
-        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed}
-        few: dict[str, Any] = {"chains": chains, "warmup": warmup, "draws": draws}
-        return sample(some, model, without_flagged=False, **settings, **few).answer()
+        more: dict[str, Any] = {"threshold_MPa": threshold_MPa, **length._asdict(), **settings}
+        return sample(some, model, without_flagged=False, **more).answer()
 
-    findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
+    return found.judged(started, again if without_flagged else None)

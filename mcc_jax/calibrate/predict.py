@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -23,7 +23,9 @@ from .estimates import summary
 from .model import Model
 from .noise import Whitening
 from .population import COEFFICIENTS, flattened
-from .results import PosteriorDraws
+
+if TYPE_CHECKING:
+    from .posterior import Posterior
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,7 @@ class PredictedCurves:
     __repr__ = described()
 
     def band(self, share: float = 0.95, *, observed: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper end of the central interval that holds `share` of the draws at each force [um].
-
-        Raises:
-            ValueError: if the share is not between 0 and 1, or noise was asked for but not drawn.
-        """
+        """Lower and upper end of the central interval that holds `share` of the draws at each force [um]."""
         share = arguments.number(share, "the share", above=0, below=1)
         draws = self.observed_um if observed else self.displacement_um
         if draws is None:
@@ -98,19 +96,11 @@ def laws_with(model: Model, C: np.ndarray, a: np.ndarray, modulus: np.ndarray, t
     return eqx.filter_vmap(one)(*(jnp.asarray(x) for x in (C, a, modulus, theta)))
 
 
-def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> MccLaw:
-    """Laws of particles never measured, for DEM or any other use: one posterior draw of the population each.
+def sample_laws(calibration: Posterior, count: int, *, seed: int = 0) -> MccLaw:
+    """Laws of `count` particles never measured: one posterior draw of the population each.
 
-    They carry both the scatter of the particles and the uncertainty of the population. Laws that are not monotone are
-    kept, as the population has them (see `MccLaw.is_monotone`).
-
-    Args:
-        calibration: the posterior.
-        count: how many.
-        seed: random seed.
-
-    Returns:
-        A batched law, every array field with a leading axis.
+    They carry both the scatter of the particles and the uncertainty of the population, in one law whose array fields
+    have a leading axis. Laws that are not monotone are kept, as the population has them (see `MccLaw.is_monotone`).
     """
     count = arguments.whole(count, "count", least=1)
     rng = np.random.default_rng(arguments.seed(seed))
@@ -127,7 +117,7 @@ def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> Mc
 
 
 def predict_new_particle(
-    calibration: PosteriorDraws,
+    calibration: Posterior,
     diameters_um: Any,
     force_mN: Any,
     time_s: Any = None,
@@ -149,24 +139,18 @@ def predict_new_particle(
         InputError: for diameters that are not positive, or a path that is none.
     """
     sizes = arguments.one_particle(diameters_um)
-    force_mN = np.asarray(arguments.path(force_mN, "force_mN"))
-    if not np.isfinite(force_mN).all():
-        raise InputError(f"force_mN is {force_mN[~np.isfinite(force_mN)][0]} at one point", remedy="Leave it out.")
-    time = np.zeros(len(force_mN)) if time_s is None else np.asarray(arguments.path(time_s, "time_s"))
-    arguments.same_length(force_mN=force_mN, time_s=time)
+    force = np.asarray(arguments.path(force_mN, "force_mN"), float)
+    if not np.isfinite(force).all():
+        raise InputError(f"force_mN is {force[~np.isfinite(force)][0]} at one point", remedy="Leave it out.")
+    time = np.zeros(len(force)) if time_s is None else np.asarray(arguments.path(time_s, "time_s"))
+    arguments.same_length(force_mN=force, time_s=time)
     laws = sample_laws(calibration, count, seed=seed)
-    paths = _paths(laws, Particle(*sizes), jnp.asarray(np.asarray(force_mN, float)), jnp.asarray(time))
-    return PredictedCurves(np.asarray(force_mN, float), np.asarray(paths), None, laws)
+    paths = _paths(laws, Particle(*sizes), jnp.asarray(force), jnp.asarray(time))
+    return PredictedCurves(force, np.asarray(paths), None, laws)
 
 
-def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
+def predict_measured(calibration: Posterior, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
     """Draws of a measured particle's curve at its measured forces, its zero included, without and with noise.
-
-    Args:
-        calibration: the posterior.
-        particle: its name.
-        count: number of draws.
-        seed: random seed.
 
     Raises:
         InputError: if the particle did not take part.
@@ -182,31 +166,22 @@ def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int =
     return predicted_at(calibration, row, pick, seed)
 
 
-def predicted_at(calibration: PosteriorDraws, row: int, pick: np.ndarray, seed: int) -> PredictedCurves:
+def predicted_at(calibration: Posterior, row: int, pick: np.ndarray, seed: int) -> PredictedCurves:
     """As `predict_measured`, of the row-th particle at chosen draws of all chains in a row."""
-    tests = calibration.selection.tests
-    length = len(calibration.selection.rows[row])
-
-    def chosen(values: np.ndarray) -> np.ndarray:
-        return flattened(values)[pick]
-
-    laws = laws_with(
-        calibration.model,
-        chosen(calibration.C[:, :, row]),
-        chosen(np.asarray(calibration.population.a)),
-        chosen(calibration.modulus_MPa[:, :, row]),
-        chosen(calibration.theta[:, :, row]),
+    c, length = calibration, len(calibration.selection.rows[row])
+    of_particle = (x[:, :, row] for x in (c.C, c.modulus_MPa, c.theta, c.zero_um))
+    C, modulus, theta, zero, a, log_noise = (
+        flattened(np.asarray(x))[pick] for x in (*of_particle, c.population.a, c.population.log_noise)
     )
-    tests, filters = (jax.tree.map(lambda x: x[row], tree) for tree in (tests, calibration.fit.filters))
-    zero = chosen(calibration.zero_um[:, :, row])[:, None]
-    clean = np.asarray(predicted_by(laws, tests.particle, tests.record)) + zero
-    factor = np.exp(chosen(np.asarray(calibration.population.log_noise)))[:, None]
+    laws = laws_with(c.model, C, a, modulus, theta)
+    test, filters = jax.tree.map(lambda x: x[row], (c.selection.tests, c.fit.filters))
+    clean = np.asarray(predicted_by(laws, test.particle, test.record)) + zero[:, None]
     noise = np.asarray(_noise(filters, jax.random.key(seed), len(pick)))
-    observed = clean + factor * noise
-    return PredictedCurves(np.asarray(tests.force)[:length], clean[:, :length], observed[:, :length], laws)
+    observed = clean + np.exp(log_noise)[:, None] * noise
+    return PredictedCurves(np.asarray(test.force)[:length], clean[:, :length], observed[:, :length], laws)
 
 
-def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
+def compare_with_paper(calibration: Posterior) -> list[dict[str, Any]]:
     """The paper's Table 2, a and modulus next to ours: one row per quantity, with mean, sd and interval of ours."""
     named = calibration.named_population()
     paper: dict[str, float | None] = {"a": PAPER_SHAPE_PARAMETER}

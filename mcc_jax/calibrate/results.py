@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import abc
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -21,13 +21,11 @@ from ..effects import Variant
 from ..law import MccLaw
 from .curves import FittedCurve, fitted_curves
 from .data import Selection, compared_rows, ranges_um, root_mean_squares
-from .estimates import estimate, finite, force_zero, log_estimate
-from .judgement import misfit_note, noise_note, noise_share
-from .laws import law_of
+from .estimates import estimate, finite, force_zero, law_of, log_estimate, quantities
+from .judgement import judged, misfit_note, noise_note, noise_share, unlike_others
 from .mode import Fit
 from .model import Model
-from .population import COEFFICIENTS, Population
-from .summary import quantities, summary_table
+from .population import COEFFICIENTS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,15 +34,17 @@ ARCHIVE, CONTENT, DISCOVERY_ARCHIVE = "calibration.msgpack", "calibration.json",
 A_FOLDER = "Give a folder that a result's save, mcc-jax calibrate or mcc-jax discover wrote into."
 
 
-class Saved(abc.ABC):
+class Saved:
     """What is written as JSON for people and as an archive that `mcc_jax.load` reads."""
 
     content_file: ClassVar[str]
     archive_file: ClassVar[str]
+    content: Any
+    """The contents of the JSON, worked out once: a cached property of every kind of result."""
 
-    @abc.abstractmethod
     def to_json(self) -> dict[str, Any]:
         """The contents of the JSON."""
+        return self.content
 
     def save(self, folder: str | Path) -> None:
         """Write the JSON and what `mcc_jax.load` reads into a folder: both or nothing.
@@ -56,11 +56,9 @@ class Saved(abc.ABC):
             self.write(stage.folder)
 
     def write(self, folder: Path, **more: Any) -> dict[str, Any]:
-        """Write the files of `save` into a folder that appears as a whole; returns the contents of the JSON.
+        """Write the files of `save` into an existing folder that appears as a whole; returns the contents of the JSON.
 
-        Args:
-            folder: an existing folder.
-            more: further entries of the JSON, such as provenance.
+        `more` are further entries of the JSON, such as provenance.
         """
         content = self.to_json() | more
         (folder / self.content_file).write_text(json_text(content), encoding="utf-8")
@@ -72,7 +70,7 @@ class Calibration(Saved):
     """A calibration of any method: `law`, `curves`, `save`; `mcc_jax.load` reads what was saved."""
 
     content_file, archive_file = CONTENT, ARCHIVE
-    archived: ClassVar[tuple[str, ...]] = ("curves",)  # kept with the fields: nobody works them out again
+    archived: ClassVar[tuple[str, ...]] = ("curves",)  # saved with the fields, so that they are not worked out again
     campaign: Campaign
 
     def __repr__(self) -> str:
@@ -87,9 +85,15 @@ class Calibration(Saved):
         return table(title, rows)
 
     def summary(self) -> pd.DataFrame:
-        """Value, standard deviation and ends of the 95 % interval (columns) of the law's numbers (rows); NaN if
+        """Value, standard deviation and ends of the 95 % interval (columns) of the law's parameters (rows); NaN if
         unknown."""
-        return summary_table(self.to_json())
+        import pandas as pd
+
+        rows = {}
+        for one in quantities(self.to_json()):
+            low, high = one.estimate["interval_95"] or (None, None)
+            rows[one.name] = {"value": one.estimate["value"], "sd": one.estimate["sd"], "low_95": low, "high_95": high}
+        return pd.DataFrame.from_dict(rows, orient="index", dtype=float)
 
     def law(self, particle: str | None = None) -> MccLaw:
         """The calibrated law.
@@ -98,7 +102,7 @@ class Calibration(Saved):
             particle: take this particle's own coefficients; if None those of the median particle, exp(mean of log C).
 
         Raises:
-            InputError: for a particle that took no part, or numbers that the calibration does not have.
+            InputError: for a particle that took no part, or parameters that the calibration does not have.
         """
         sizes = dict(zip(self.campaign.particles, self.campaign.diameters_um, strict=True))
         return law_of(self.to_json(), particle, None if particle is None else sizes.get(particle), self.variants)
@@ -154,6 +158,16 @@ class JointCalibration(Calibration):
         """Root mean square residual of every particle [um], shape (N,)."""
         return root_mean_squares(self.selection.tests, self.residual())
 
+    def judged(self, started: float, again: Callable[[Campaign], Mapping[str, Any]] | None) -> Self:
+        """The same with findings, see `judgement.judged`, and the time it took since it was started."""
+        outlying = unlike_others(self.particles, self.rms_um(), ranges_um(self.selection.tests))
+        findings = judged(self.campaign, self.answer(), outlying, again)
+        return replace(cast(Any, self), findings=findings, runtime_s=time.perf_counter() - started)
+
+    def answer(self) -> dict[str, Any]:
+        """Whether it converged, a and the modulus, as in `calibration.json`."""
+        raise NotImplementedError
+
     @property
     def own_misfit(self) -> float:
         """Median over the particles of `rms_um`, in shares of the range of displacement [-]."""
@@ -184,12 +198,7 @@ class JointCalibration(Calibration):
         return {name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0) for name, m, s in numbers}
 
     def _entries(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
-        """Entries of every particle of the campaign in files.
-
-        Args:
-            numbers: estimates of a row of the tests.
-            more: further numbers of all rows.
-        """
+        """Entries of every particle in files, from estimates of a row of the tests and further values of all rows."""
         row_of = {i: row for row, i in enumerate(self.selection.kept)}
         further = {"rms_um": self.rms_um(), "noise_scale": np.asarray(self.fit.noise.noise.scale)} | more
         nothing: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
@@ -204,21 +213,6 @@ class JointCalibration(Calibration):
             }
             for i, name in enumerate(self.campaign.particles)
         ]
-
-
-class PosteriorDraws(JointCalibration):
-    """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
-
-    population: Population
-    C: np.ndarray
-    modulus_MPa: np.ndarray
-    zero_um: np.ndarray
-    theta: np.ndarray
-    seed: int
-
-    @abc.abstractmethod
-    def named_population(self) -> dict[str, np.ndarray]:
-        """Draws of the population by the names used in files, shape (chains, draws)."""
 
 
 def load(folder: str | Path) -> Any:
@@ -254,11 +248,7 @@ def load(folder: str | Path) -> Any:
 
 
 def read_saved(archive: Path) -> Any:
-    """The result in an archive, whose name says of which kind it is.
-
-    Raises:
-        InputError: if it is damaged, foreign or of a newer version.
-    """
+    """The result in an archive, whose name says of which kind it is; raises `InputError` as `load` does."""
     found = read_archive(archive)
     if not isinstance(found, Saved) or found.archive_file != archive.name:
         raise InputError(f"holds a {type(found).__name__}", file=archive, remedy=A_FOLDER)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
+from .._extras import extra
 from .._store import Stage, results
 from . import options as common
 from .session import (
@@ -143,7 +144,7 @@ def calibrate(
         with results(out) as stage:
             calibration = _calibrated(data, method, options, progress)
             content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, progress=progress)
-    from ..calibrate.summary import quantities
+    from ..calibrate.estimates import quantities
 
     if as_json:
         say_json(content)
@@ -192,13 +193,16 @@ def write_calibration(
     Files that an earlier calibration lists as its own, and this one does not write, become stale: they would contradict
     what is next to them now. `origin` is what `provenance` gives. Returns the contents of `calibration.json`.
     """
-    from ..calibrate import Posterior, write_posterior
+    from ..calibrate import Posterior
 
     names = write_figures(stage, RESULT, functools.partial(_draw, calibration) if figures else None, progress)
     files = [ARCHIVE]
     if isinstance(calibration, Posterior):
         progress("writing the posterior")
-        write_posterior(calibration, stage.folder / POSTERIOR)
+        with extra("netcdf"):
+            import h5netcdf  # noqa: F401
+            import h5py  # noqa: F401
+        calibration.to_arviz(seed=calibration.seed).to_netcdf(stage.folder / POSTERIOR, engine="h5netcdf")
         files.append(POSTERIOR)
     ours = "|".join((POSTERIOR, ARCHIVE))
     stage.stale += [name for name in listed(stage.directory / RESULT, "files", ours) if name not in files]

@@ -146,7 +146,7 @@ def _campaign(seed: int, effect: HiddenEffect) -> Campaign:
 
 def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
     """Print what the law alone said, where it fails, the name, and what adding it did."""
-    from ..calibrate.summary import quantities
+    from ..calibrate.estimates import quantities
     from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
     from ..discovery.sentences import headline
 

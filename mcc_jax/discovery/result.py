@@ -11,8 +11,7 @@ import numpy as np
 from .._errors import InputError
 from .._format import described, table
 from ..calibrate import Model, Posterior
-from ..calibrate.estimates import estimate, finite
-from ..calibrate.laws import law_of
+from ..calibrate.estimates import estimate, finite, law_of
 from ..calibrate.results import DISCOVERY_ARCHIVE, Calibration, Saved
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
@@ -263,10 +262,6 @@ class Discovery(Saved):
             for jump in effect.jumps
         ]
         return {"jumps": jumps} if jumps else {}
-
-    def to_json(self) -> dict[str, Any]:
-        """The contents of `discovery.json`."""
-        return self.content
 
     @cached_property
     def content(self) -> dict[str, Any]:

@@ -15,9 +15,9 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from ..calibrate.laws import COEFFICIENTS, entry_of
+from ..calibrate.estimates import entry_of, exponential
+from ..calibrate.population import COEFFICIENTS
 from ..calibrate.results import ARCHIVE, load
-from ..calibrate.summary import exponential
 from ..campaign import Campaign, read_diameters
 from ..geometry import Particle
 from ..law import MccLaw

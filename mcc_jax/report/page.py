@@ -14,7 +14,7 @@ from .._extras import extra, own_version
 from .._format import interval, listed, number, percent, plain, probability, with_sd
 from .._types import Progress
 from ..calibrate.curves import KINDS, FittedCurve
-from ..calibrate.summary import exponential
+from ..calibrate.estimates import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
 from ..discovery.sentences import verdict_in_words

@@ -14,7 +14,8 @@ import msgspec
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from ..calibrate.results import ARCHIVE, CONTENT, DISCOVERY_ARCHIVE, Calibration, PosteriorDraws, read_saved
+from ..calibrate import Posterior
+from ..calibrate.results import ARCHIVE, CONTENT, DISCOVERY_ARCHIVE, Calibration, read_saved
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..discovery import Discovery
 from ..files import RESULT_BYTES, read_regular
@@ -86,12 +87,12 @@ class Results:
     __repr__ = described()
 
     @property
-    def posterior(self) -> PosteriorDraws | None:
+    def posterior(self) -> Posterior | None:
         """The calibration, if it is one by draws of a posterior."""
-        return self.saved if isinstance(self.saved, PosteriorDraws) else None
+        return self.saved if isinstance(self.saved, Posterior) else None
 
     @property
-    def with_found(self) -> PosteriorDraws | None:
+    def with_found(self) -> Posterior | None:
         """The posterior of the law with what discovery added, if it may be believed and is of all these particles.
 
         None, too, where the calibration is of a law with effects itself, or there is none to compare it with.

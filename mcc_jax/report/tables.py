@@ -12,7 +12,7 @@ import numpy as np
 
 from .._format import interval, number, plain, span, with_sd
 from ..calibrate.curves import FittedCurve
-from ..calibrate.summary import quantities
+from ..calibrate.estimates import quantities
 from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from .read import Results
 

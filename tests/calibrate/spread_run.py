@@ -37,7 +37,7 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int, ev
     # Not before: nothing may ask for devices before the processes know of each other.
     from joint_cases import five_particles
 
-    from mcc_jax.calibrate import fitting, sample, write_posterior
+    from mcc_jax.calibrate import fitting, sample
 
     fitting.block_size = lambda count: 2
     campaign = five_particles(seed)
@@ -60,8 +60,8 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int, ev
         **{name: getattr(found, name) for name in ("C", "modulus_MPa", "zero_um", "log_likelihood", "pareto_k")},
     }
     np.savez(folder / f"arrays_{process}.npz", **{name: np.asarray(value) for name, value in arrays.items()})
-    write_posterior(found, folder / "posterior.nc")
     if jax.process_index() == 0:
+        found.to_arviz().to_netcdf(folder / "posterior.nc")
         content = {**found.to_json(), "runtime_s": None}
         (folder / "calibration.json").write_text(json.dumps(content), encoding="utf-8")
 

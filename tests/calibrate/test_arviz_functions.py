@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mcc_jax import paper_campaign, sample
-from mcc_jax.calibrate import to_arviz
 
 matplotlib.use("agg")
 NAMES = ("first", "second")
@@ -25,12 +24,12 @@ def posteriors(paper_posterior):
 
 @pytest.fixture(scope="module")
 def by_particle(posteriors):
-    return {name: to_arviz(one) for name, one in posteriors.items()}
+    return {name: one.to_arviz() for name, one in posteriors.items()}
 
 
 @pytest.fixture(scope="module")
 def by_reading(posteriors):
-    return to_arviz(posteriors["first"], points=True)
+    return posteriors["first"].to_arviz(points=True)
 
 
 def test_summary(by_particle):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcc_jax import load
-from mcc_jax.calibrate.laws import law_of
+from mcc_jax.calibrate.estimates import law_of
 from mcc_jax.calibrate.results import Calibration
 
 SIZES = {"A": (200, 190, 160), "b c": (150, 140, 130), "falling": (150, 140, 130), "out": (100, 90, 80)}
@@ -72,9 +72,6 @@ class Numbers(Calibration):
 
     content: dict
     campaign = None
-
-    def to_json(self):
-        return self.content
 
     def law(self, particle=None):
         return law_of(self.content, particle, None if particle is None else np.array(SIZES[particle], float))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -96,7 +97,10 @@ def _report(_):
 
 
 def _write(folder):
-    return mcc.calibrate.write_posterior(object.__new__(mcc.Posterior), folder / "posterior.nc")
+    from mcc_jax.cli.calibrate import write_calibration
+
+    stage = SimpleNamespace(folder=folder, directory=folder, stale=[])
+    return write_calibration(object.__new__(mcc.Posterior), stage, origin={}, figures=False, progress=print)
 
 
 CALLS = {

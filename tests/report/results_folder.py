@@ -9,8 +9,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from mcc_jax.calibrate import Posterior
 from mcc_jax.calibrate.data import rows_from_contact
-from mcc_jax.calibrate.results import Calibration, PosteriorDraws, read_saved
+from mcc_jax.calibrate.results import Calibration, read_saved
 from mcc_jax.campaign import Campaign, campaign_segments, file_checksums, write_campaign
 from mcc_jax.discovery import Discovery
 from mcc_jax.effects import find_variant
@@ -165,17 +166,11 @@ def discovery(**changes):
     } | changes
 
 
-@dataclass(frozen=True)
-class Draws(PosteriorDraws):
+class Draws(Posterior):
     """Stands in for a saved posterior: draws around the truth, and bands of noise that these tests do not have."""
 
-    campaign: Campaign
-    content: dict
-    of_a: np.ndarray
-    seed: int = 0
-
-    def to_json(self):
-        return self.content
+    def __init__(self, campaign, content, of_a):
+        vars(self).update(campaign=campaign, content=content, of_a=of_a, seed=0)
 
     @property
     def variants(self):
@@ -211,9 +206,6 @@ class Numbers(Calibration):
 
     campaign: Campaign
     content: dict
-
-    def to_json(self):
-        return self.content
 
 
 class Found(Discovery):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, get_args
 
 import equinox as eqx
@@ -161,7 +162,8 @@ class PaperCalibration(Calibration):
             "effective_modulus_MPa": estimate(self.elastic.effective_modulus_MPa),
         }
 
-    def to_json(self) -> dict[str, Any]:
+    @cached_property
+    def content(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         population = self.plastic.population
         eta = np.asarray(eqx.filter_vmap(self.mean_law.shape_factor)(particle_batch(self.campaign.diameters_um)))
