@@ -1,13 +1,13 @@
 """From a campaign to the law's parameters."""
 
+from .campaigns import calibrate_many as calibrate_many
+from .campaigns import compare as compare
+from .campaigns import fit as fit
+from .campaigns import log_evidence as log_evidence
 from .curves import FittedCurve as FittedCurve
 from .data import select_tests as select_tests
-from .evidence import compare as compare
-from .evidence import fit as fit
-from .evidence import log_evidence as log_evidence
 from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
-from .many_campaigns import calibrate_many as calibrate_many
 from .mode import Fit as Fit
 from .model import Model as Model
 from .paper.calibrate import PaperCalibration as PaperCalibration

@@ -1,13 +1,17 @@
-"""Comparing models: the fit of one, its log marginal likelihood, and several side by side."""
+"""Whole campaigns: the fit of one, models of one compared by evidence and held-out particles, many in a queue."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Progress
@@ -16,6 +20,7 @@ from .compiling import one_blas_thread
 from .fitting import checked_settings, prepare
 from .importance import smoothed
 from .judgement import numbers_in_reach
+from .least_squares import LeastSquares, least_squares
 from .mode import Fit
 from .model import Model
 from .posterior import Posterior, sample
@@ -34,10 +39,7 @@ def fit(
 ) -> Fit:
     """Fit particles, noise and population of a campaign: where samplers start, and in what coordinates.
 
-    For the arguments see `sample`.
-
-    Raises:
-        InputError: if no particle can be used; for an argument of the wrong kind or out of its range.
+    For arguments and errors see `sample`.
     """
     campaign = check_tests(campaign)
     progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
@@ -46,14 +48,17 @@ def fit(
     return found.first(len(selection.kept))
 
 
+# ---- models of one campaign ------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """The log marginal likelihood of a model: how probable the tests are under it, all its numbers integrated out.
+    """The log marginal likelihood of a model: how probable the tests are under it, all its parameters integrated out.
 
     Attributes:
         value: natural logarithm.
         error: its standard error; infinite where it is Laplace's approximation alone.
-        pareto_k: of the importance weights behind it; above 0.7 they are not to be relied on.
+        pareto_k: of the importance weights behind it; above 0.7 they are unreliable.
     """
 
     value: float
@@ -67,7 +72,7 @@ def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, 
     """The log marginal likelihood of a model, by importance sampling around its fit.
 
     Population and effects are integrated by importance sampling, particles by Laplace's approximation corrected with
-    the exact likelihood, the four numbers of the noise by Laplace's method around their mode.
+    the exact likelihood, the four parameters of the noise by Laplace's method around their mode.
 
     Args:
         campaign: the tests, or a posterior that was sampled.
@@ -77,8 +82,10 @@ def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, 
     Raises:
         InputError: for a model with robust noise.
     """
-    _refuse_robust(campaign.model if isinstance(campaign, Posterior) else model)
-    posterior = campaign if isinstance(campaign, Posterior) else sample(campaign, model, seed=seed)
+    if isinstance(campaign, Posterior):
+        posterior = _sampled(campaign.campaign, campaign, seed)
+    else:
+        posterior = _sampled(campaign, model or Model(), seed)
     k = np.inf if posterior.pareto_k_joint is None else posterior.pareto_k_joint
     return Evidence(*posterior.log_evidence, float(k))
 
@@ -104,20 +111,15 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
 
     if not models:
         raise InputError("there is no model to compare")
-    for one in models:
-        _refuse_robust(one.model if isinstance(one, Posterior) else one)
-    found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
-    counted = [np.asarray(one.selection.tests.mask).sum(1) for one in found]
-    if any(
-        one.particles != found[0].particles or not np.array_equal(n, counted[0])
-        for one, n in zip(found, counted, strict=True)
-    ):
+    found = [_sampled(campaign, one, seed) for one in models]
+    tests = [(one.particles, np.asarray(one.selection.tests.mask).sum(1).tolist()) for one in found]
+    if any(one != tests[0] for one in tests):
         raise InputError("the posteriors rest on different tests", remedy="Sample them from the same campaign.")
     rows, elpds = [], []
     for one in found:
-        lookup = np.moveaxis(one.log_likelihood.reshape(-1, len(one.particles)), 0, -1)
         # Draws of the posterior without a particle are those of all, weighted by one over its likelihood.
-        elpds.append(np.array([logsumexp(smoothed(-each)[0] + each) for each in lookup]))
+        of_particles = one.log_likelihood.reshape(-1, len(one.particles)).T
+        elpds.append(np.array([logsumexp(smoothed(-each)[0] + each) for each in of_particles]))
         rows.append(
             {
                 "model": ", ".join(one.model.variants) or "no effects",
@@ -139,12 +141,13 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     return pd.DataFrame(rows)
 
 
-def _refuse_robust(model: Model | None) -> None:
-    if model is not None and model.robust:
+def _sampled(campaign: Campaign, one: Model | Posterior, seed: int) -> Posterior:
+    if (one.model if isinstance(one, Posterior) else one).robust:
         raise InputError(
             "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's",
             remedy="Compare models with robust=False.",
         )
+    return one if isinstance(one, Posterior) else sample(campaign, one, seed=seed)
 
 
 def _chi2(one: Posterior, base: Posterior) -> float:
@@ -155,3 +158,53 @@ def _chi2(one: Posterior, base: Posterior) -> float:
     mask = np.asarray(base.selection.tests.mask)
     squares = np.asarray(one.fit.residual) ** 2 / np.where(mask, np.maximum(white, 1e-300), 1.0)
     return float(np.where(mask, squares, 0.0).sum() / mask.sum())
+
+
+# ---- many campaigns --------------------------------------------------------------------------------------------------
+
+
+@one_blas_thread
+def calibrate_many(
+    campaigns: Iterable[Campaign],
+    *,
+    method: str = "bayes",
+    threshold_MPa: float = THRESHOLD_MPA,
+    progress: Callable[[int, str], None] | None = None,
+    **settings: Any,
+) -> list[Posterior | LeastSquares | Exception]:
+    """Calibrate many campaigns, one after another.
+
+    Campaigns of similar size share one compilation: every calibration pads its campaign to one of few sizes, with
+    copies of a particle that count for nothing and with masked points. So every result is that of `sample` or
+    `least_squares` with the same settings and seed, bit for bit. The posterior's mode "joint" pads points only.
+
+    Args:
+        campaigns: the campaigns.
+        method: "bayes" or "least-squares".
+        threshold_MPa: points below this stress on loading do not count [MPa].
+        progress: called with a campaign's position and the name of its step, "done" or "failed" last.
+        settings: of `sample` or `least_squares`: model, seed, chains, loss, ...
+
+    Returns:
+        Results in the order of the campaigns; in place of one that fails, its exception.
+
+    Raises:
+        InputError: if the method is unknown.
+        TypeError: for settings that the method does not have.
+    """
+    methods: dict[str, Callable[..., Posterior | LeastSquares]] = {"bayes": sample, "least-squares": least_squares}
+    calibrate = methods[arguments.choice(method, methods, "method")]
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
+    if isinstance(campaigns, str | Path | Campaign) or not isinstance(campaigns, Iterable):
+        raise InputError(f"campaigns must be a list of campaigns, got {arguments.kind_of(campaigns)}")
+    inspect.signature(calibrate).bind(None, threshold_MPa=threshold_MPa, progress=None, **settings)
+    found: list[Posterior | LeastSquares | Exception] = []
+    progress = progress or (lambda _, __: None)
+    for i, campaign in enumerate(campaigns):
+        try:
+            step = partial(progress, i)
+            found.append(calibrate(campaign, threshold_MPa=threshold_MPa, progress=step, **settings))
+        except Exception as error:  # whatever it is, it takes its campaign's place
+            found.append(error)
+        progress(i, "failed" if isinstance(found[i], Exception) else "done")
+    return found
