@@ -82,10 +82,8 @@ def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, 
     Raises:
         InputError: for a model with robust noise.
     """
-    if isinstance(campaign, Posterior):
-        posterior = _sampled(campaign.campaign, campaign, seed)
-    else:
-        posterior = _sampled(campaign, model or Model(), seed)
+    _refuse_robust(campaign if isinstance(campaign, Posterior) else model)
+    posterior = campaign if isinstance(campaign, Posterior) else sample(campaign, model, seed=seed)
     k = np.inf if posterior.pareto_k_joint is None else posterior.pareto_k_joint
     return Evidence(*posterior.log_evidence, float(k))
 
@@ -111,7 +109,9 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
 
     if not models:
         raise InputError("there is no model to compare")
-    found = [_sampled(campaign, one, seed) for one in models]
+    for one in models:
+        _refuse_robust(one)
+    found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
     tests = [(one.particles, np.asarray(one.selection.tests.mask).sum(1).tolist()) for one in found]
     if any(one != tests[0] for one in tests):
         raise InputError("the posteriors rest on different tests", remedy="Sample them from the same campaign.")
@@ -141,13 +141,13 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     return pd.DataFrame(rows)
 
 
-def _sampled(campaign: Campaign, one: Model | Posterior, seed: int) -> Posterior:
-    if (one.model if isinstance(one, Posterior) else one).robust:
+def _refuse_robust(one: Model | Posterior | None) -> None:
+    model = one.model if isinstance(one, Posterior) else one
+    if model is not None and model.robust:
         raise InputError(
             "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's",
             remedy="Compare models with robust=False.",
         )
-    return one if isinstance(one, Posterior) else sample(campaign, one, seed=seed)
 
 
 def _chi2(one: Posterior, base: Posterior) -> float:

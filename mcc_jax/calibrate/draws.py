@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 from jaxtyping import Array
+from numpyro.infer.util import constrain_fn
 
 from .compiling import compiled
+from .data import Tests
 from .estimates import effect_numbers
 from .importance import diagnostics, sample_weighted
-from .mode import Fit, LogPosterior, log_densities, populations
-from .model import Model
+from .marginal import Marginal, ParticleDraw
+from .mode import ACCEPT, Fit, handlers, log_densities, populations, seeded
+from .model import Model, coefficients
 from .noise import standard_promotion
 from .particles import PROBES, Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
@@ -62,7 +68,7 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: boo
 class Run(NamedTuple):
     """Draws of the population, chains in a row, divergences, and leapfrog steps a draw (0 of independent draws)."""
 
-    population: Population
+    population: Any
     divergences: int = 0
     leapfrogs: float = 0.0
 
@@ -71,90 +77,126 @@ def _sampled(key: Array, fit: Fit, length: Length, many: bool, fallback: bool) -
     """Draws of the population, independent and weighted if the weights are good enough, else NUTS's; whether they are
     good; and the log of the density's integral with its standard error, by Laplace's method where NUTS drew."""
     target = fit.target
-    shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
-    found = sample_weighted(key, fit.mode, fit.covariance, target, **shape)
-    if found is not None:
+    found = sample_weighted(key, fit.mode, fit.covariance, target, chains=length.chains, draws=length.draws, many=many)
+    if found.good:
         return Run(found.population), True, (found.log_evidence, found.error)
     volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(fit.covariance))[1] + len(target.signed()) * np.log(2)
     laplace = float(log_densities(np.asarray(fit.mode)[None], target)[0]) + float(volume), np.inf
     if not fallback:
-        bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, allow_bad_weights=True)
-        assert bad is not None
-        return Run(bad.population), False, laplace
-    free, divergent, steps = _sample_density(
-        jax.random.split(key, length.chains), fit.mode, fit.covariance, target, warmup=length.warmup, draws=length.draws
-    )
-    population = jax.tree.map(np.asarray, populations(free.reshape(-1, free.shape[-1]), target))
-    return Run(population, int(np.sum(divergent)), float(np.mean(steps))), True, laplace
+        return Run(found.population), False, laplace
+    coordinates = FitCoordinates(fit, explicit=False)
+    position, run = _nuts(key, coordinates, length, FALLBACK_ACCEPT, TREE_DEPTH)
+    population = jax.tree.map(np.asarray, populations(jax.vmap(coordinates.free)(position), target))
+    return run._replace(population=population), True, laplace
+
+
+def draw_joint(key: Array, fit: Fit, length: Length) -> dict[str, Any]:
+    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood."""
+    position, run = _nuts(key, FitCoordinates(fit), length, ACCEPT, 10)
+    population, *particles = jax.tree.map(np.asarray, _explicit(position, FitCoordinates(fit)))
+    unweighted = {"pareto_k": np.zeros(len(fit.tests)), "pareto_k_joint": None, "weights_applied": False}
+    return _collected(run._replace(population=population), particles, fit, length) | unweighted
+
+
+class FitCoordinates(eqx.Module):
+    """The model's density in the coordinates of a fit, near standard normal: widths over five powers of ten do not mix.
+
+    Explicit, every particle has its random effects, in the coordinates of its Laplace approximation and under the exact
+    likelihood; else they are integrated out.
+    """
+
+    fit: Fit
+    explicit: bool = eqx.field(static=True, default=True)
+
+    @property
+    def size(self) -> int:
+        """Number of the coordinates."""
+        fit = self.fit
+        return len(fit.names) + self.explicit * len(fit.tests) * (fit.marginal.scatter.size + 1)
+
+    def free(self, position: Array) -> Array:
+        """Unbounded coordinates of the population."""
+        return self.fit.mode + jnp.linalg.cholesky(self.fit.covariance) @ position[: len(self.fit.names)]
+
+    def particles(self, position: Array) -> tuple[Population, ParticleDraw]:
+        """Population, and particles under it."""
+        population = self.fit.target.population(self.free(position))
+        own = position[len(self.fit.names) :].reshape(len(self.fit.tests), -1)
+        return population, self.fit.marginal.draw(population, own[:, :-1], own[:, -1])
+
+    def log_density(self, position: Array) -> Array:
+        """Log density, up to a constant."""
+        target = self.fit.target
+        if not self.explicit:
+            return target.log_density(self.free(position))
+        population, drawn = self.particles(position)
+        each = exact_likelihood(self.fit).log_likelihood(population, drawn) + drawn.log_volume
+        return target.log_prior(self.free(position)) + jnp.sum(each) - 0.5 * jnp.sum(drawn.deviations**2)
+
+    def numpyro_model(self, tests: Tests, marginal: Marginal | None = None) -> None:
+        """The same as a NumPyro model, called as `Model`: every site of the model is a `deterministic`."""
+        target, improper = self.fit.target, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
+        position: Any = numpyro.sample("coordinates", improper)
+        with handlers.block():  # the population is evaluated here, and adds no sites of its own
+            prior: Any = (seeded(target.model.population), (target.marginal,), {}, target.sites(self.free(position)))
+            values = constrain_fn(*prior, return_deterministic=True)
+            density = self.log_density(position)
+            if self.explicit:
+                population, drawn = self.particles(position)
+                values |= {"C": coefficients(drawn.latent, population, tests.flatness), "zero_um": drawn.zero}
+        numpyro.factor("density", density)
+        for name, value in values.items():
+            numpyro.deterministic(name, value)
 
 
 @compiled
-def _sample_density(
-    keys: Array, mode: Array, covariance: Array, target: LogPosterior, *, warmup: int, draws: int
+def _explicit(positions: Array, coordinates: FitCoordinates) -> tuple[Any, ...]:
+    """Populations and particles at draws of the coordinates."""
+
+    def one(position: Array) -> tuple[Any, ...]:
+        population, drawn = coordinates.particles(position)
+        return population, drawn.latent, drawn.theta, drawn.zero, drawn.log_likelihood
+
+    return jax.lax.map(one, positions)
+
+
+def _nuts(key: Array, coordinates: FitCoordinates, length: Length, accept: float, depth: int) -> tuple[Array, Run]:
+    """Draws of the coordinates by NUTS, all chains in a row, and a run without its populations."""
+    keys = jax.random.split(key, length.chains)
+    z, divergent, steps = _chains(keys, coordinates, length.warmup, length.draws, accept, depth)
+    return z.reshape(-1, coordinates.size), Run(None, int(np.sum(divergent)), float(np.mean(steps)))
+
+
+@compiled
+def _chains(
+    keys: Array, coordinates: FitCoordinates, warmup: int, draws: int, accept: float, depth: int
 ) -> tuple[Array, Array, Array]:
-    """NUTS on the population's density: draws of all chains, which diverged, and leapfrog steps.
+    """Draws of all chains, which diverged, and leapfrog steps.
 
     A function of the data, compiled once for a shape: NumPyro's `MCMC` compiles again for every data set.
     """
     from numpyro.infer import NUTS
 
-    factor = jnp.linalg.cholesky(covariance)
-
     def potential(z: Array) -> Array:
-        value = -target.log_density(mode + factor @ z)
+        value = -coordinates.log_density(z)
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
-    options: dict[str, Any] = {"target_accept_prob": FALLBACK_ACCEPT, "max_tree_depth": TREE_DEPTH}
-
     def chain(key: Array) -> tuple[Array, Array, Array]:
-        kernel = NUTS(potential_fn=potential, **options)
+        kernel = NUTS(potential_fn=potential, target_accept_prob=accept, max_tree_depth=depth)
         start_key, key = jax.random.split(key)
-        state = kernel.init(key, warmup, jax.random.normal(start_key, mode.shape, mode.dtype), (), {})
+        start = jax.random.normal(start_key, (coordinates.size,), coordinates.fit.mode.dtype)
+        state = kernel.init(key, warmup, start, (), {})
 
         def advance(state: Any, _: None) -> tuple[Any, tuple[Array, Array, Array]]:
             state = kernel.sample(state, (), {})
             return state, (state.z, state.diverging, state.num_steps)
 
         # One loop for warm-up and draws, so that the sampler is compiled once.
-        _, (z, divergent, steps) = jax.lax.scan(advance, state, None, length=warmup + draws)
-        return mode + z[warmup:] @ factor.T, divergent[warmup:], steps[warmup:]
+        _, found = jax.lax.scan(advance, state, None, length=warmup + draws)
+        return jax.tree.map(lambda x: x[warmup:], found)
 
     with standard_promotion():
         return jax.vmap(chain)(keys)
-
-
-def draw_joint(key: Array, fit: Fit, length: Length) -> dict[str, Any]:
-    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
-    from numpyro.infer import MCMC
-
-    with standard_promotion():
-        mcmc = MCMC(
-            fit.nuts(explicit=True),
-            num_warmup=length.warmup,
-            num_samples=length.draws,
-            num_chains=length.chains,
-            chain_method="vectorized",
-            progress_bar=False,
-        )
-        mcmc.run(key, fit.tests, extra_fields=("diverging", "num_steps"))
-        samples, extra = mcmc.get_samples(), mcmc.get_extra_fields()
-    sites = {name: jnp.asarray(samples[name]) for name in (*fit.names, "own")}
-    population, particles = jax.tree.map(np.asarray, _explicit(sites, fit.target))
-    run = Run(population, int(np.sum(extra["diverging"])), float(np.mean(extra["num_steps"])))
-    unweighted = {"pareto_k": np.zeros(len(fit.tests)), "pareto_k_joint": None, "weights_applied": False}
-    return _collected(run, particles, fit, length) | unweighted
-
-
-@compiled
-def _explicit(sites: dict[str, Array], target: LogPosterior) -> tuple[Population, tuple[Array, ...]]:
-    """Populations and particles at draws of the explicit model's sites."""
-
-    def one(values: dict[str, Array]) -> tuple[Population, tuple[Array, ...]]:
-        population, own = target.at_values(values), values["own"]
-        drawn = target.marginal.draw(population, own[:, :-1], own[:, -1])
-        return population, (drawn.latent, drawn.theta, drawn.zero, drawn.log_likelihood)
-
-    return jax.lax.map(one, sites)
 
 
 def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1) -> dict[str, Any]:

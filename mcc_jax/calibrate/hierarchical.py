@@ -49,8 +49,7 @@ class Normal(eqx.Module):
 
     def schur(self, damping: Any = 0.0) -> tuple[Cholesky, Float[Array, "particles P Q"], Float[Array, "Q Q"]]:
         """Factor of D, D^-1 B and the Schur complement, each diagonal enlarged by 1 + damping."""
-        D = _damped(self.local, damping)
-        factor = Cholesky(D)
+        factor = Cholesky(_damped(self.local, damping))
         inner = jnp.stack([factor.solve(self.border[..., q]) for q in range(self.border.shape[-1])], -1)
         complement = _damped(self.shared, damping) - jnp.einsum("npq,npr->qr", self.border, inner)
         return factor, inner, complement
@@ -85,22 +84,17 @@ def normal_equations(push: Callable[[Parameters], Any], residual: Any, y: Parame
     `push` is the directional derivative of the residual; every leaf of it has the particles as its first axis.
     """
     count, P = y.local.shape
-    Q = y.shared.shape[0]
-    eye = jnp.eye(P + Q)
+
+    def flat(tree: Any) -> Float[Array, "particles residuals"]:
+        return jnp.concatenate([leaf.reshape(count, -1) for leaf in jax.tree.leaves(tree)], axis=1)
 
     def column(direction: Float[Array, " PQ"]) -> Float[Array, "particles residuals"]:
-        out = push(Parameters(jnp.broadcast_to(direction[:P], (count, P)), direction[P:]))
-        return _flat(out, count)
+        return flat(push(Parameters(jnp.broadcast_to(direction[:P], (count, P)), direction[P:])))
 
-    J = jax.vmap(column, out_axes=-1)(eye)
-    r = _flat(residual, count)
+    J = jax.vmap(column, out_axes=-1)(jnp.eye(P + len(y.shared)))
     whole = jnp.einsum("nkp,nkq->npq", J, J)
-    gradient = jnp.einsum("nkp,nk->np", J, r)
+    gradient = jnp.einsum("nkp,nk->np", J, flat(residual))
     return Normal(whole[:, :P, :P], whole[:, :P, P:], whole[:, P:, P:].sum(0), gradient[:, :P], gradient[:, P:].sum(0))
-
-
-def _flat(tree: Any, count: int) -> Float[Array, "particles residuals"]:
-    return jnp.concatenate([leaf.reshape(count, -1) for leaf in jax.tree.leaves(tree)], axis=1)
 
 
 class ArrowDescent(optx.AbstractDescent[Parameters, optx.FunctionInfo.ResidualJac, Normal]):
@@ -108,10 +102,8 @@ class ArrowDescent(optx.AbstractDescent[Parameters, optx.FunctionInfo.ResidualJa
 
     def init(self, y: Parameters, f_info_struct: Any) -> Normal:
         """Normal equations of the right shapes, all zero."""
-        count, P = y.local.shape
-        Q = y.shared.shape[0]
-        zeros = (jnp.zeros(s) for s in ((count, P, P), (count, P, Q), (Q, Q), (count, P), (Q,)))
-        return Normal(*zeros)
+        (count, P), Q = y.local.shape, len(y.shared)
+        return Normal(*(jnp.zeros(s) for s in ((count, P, P), (count, P, Q), (Q, Q), (count, P), (Q,))))
 
     def query(self, y: Parameters, f_info: Any, state: Normal) -> Normal:
         """The normal equations at `y`."""
@@ -145,15 +137,9 @@ class Solution(eqx.Module):
 
     def first(self, count: int) -> Solution:
         """The same of the first `count` particles."""
-        value, normal = self.value, self.normal
-        first = replace(
-            normal,
-            local=normal.local[:count],
-            border=normal.border[:count],
-            gradient_local=normal.gradient_local[:count],
-        )
-        residual = jax.tree.map(lambda x: x[:count], self.residual)
-        return replace(self, value=value._replace(local=value.local[:count]), residual=residual, normal=first)
+        value, n = self.value._replace(local=self.value.local[:count]), self.normal
+        normal = Normal(n.local[:count], n.border[:count], n.shared, n.gradient_local[:count], n.gradient_shared)
+        return replace(self, value=value, normal=normal, residual=jax.tree.map(lambda x: x[:count], self.residual))
 
 
 def minimise(
@@ -193,7 +179,7 @@ LEAST_SPREAD = 1e-4  # least standard deviation of log C in the residuals: with 
 class Pooled(eqx.Module):
     """Settings of the pooled least squares.
 
-    The zeros' prior is their distance from the recorded contact [um], `further` that of every further number of an
+    `zero_prior` is that of the offsets from the recorded contact [um], `further` that of every further parameter of an
     effect, of its logarithm if it is positive: mean and standard deviation each. `loss` applies to whitened residuals.
     """
 
@@ -211,14 +197,11 @@ SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
 
 
 def unpack(y: Parameters, settings: Pooled, tests: Tests) -> Point:
-    """Every particle's numbers: local are b1, b3, b5, zero and, where they differ, e and amplitudes."""
+    """Every particle's parameters: local are b1, b3, b5, zero and, where they differ, e and amplitudes."""
     scatter, size = settings.scatter, len(settings.forms.effects)
-    if scatter.modulus:
-        latent, own = jnp.concatenate([y.local[:, :3], y.local[:, 4:5]], 1), y.local[:, 5:]
-    else:
-        log_eta = jnp.log(jnp.maximum(1 + y.shared[0] * tests.flatness, 1e-3))
-        e = y.shared[1] + scatter.power * log_eta
-        latent, own = jnp.concatenate([y.local[:, :3], e[:, None]], 1), y.local[:, 4:]
+    log_eta = jnp.log(jnp.maximum(1 + y.shared[0] * tests.flatness, 1e-3))
+    e = y.local[:, 4] if scatter.modulus else y.shared[1] + scatter.power * log_eta
+    latent, own = jnp.concatenate([y.local[:, :3], e[:, None]], 1), y.local[:, 4 + scatter.modulus :]
     amplitudes, further = y.shared[len(SHARED) :][:size], y.shared[len(SHARED) + size :]
     positive = settings.forms.positive
     theta = jnp.concatenate([amplitudes, jnp.where(positive, jnp.exp(jnp.where(positive, further, 0.0)), further)])
@@ -229,13 +212,11 @@ def unpack(y: Parameters, settings: Pooled, tests: Tests) -> Point:
 
 
 def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tuple[Array, ...]]:
-    r"""Residuals of the pooled least squares, as a function of the parameters.
-
-    Whitened residuals of displacement, deviations of the particles from the population in its standard deviations, of
-    the zeros from the recorded contacts, and of the effects' further numbers from what is plausible.
-    """
+    """Residuals as a function of the parameters: whitened ones of displacement, deviations of the particles from the
+    population, of the zeros from the recorded contacts, and of the effects' further parameters from their priors, in
+    standard deviations."""
     scatter, at = settings.scatter, settings.population
-    size = 4 if scatter.modulus else 3
+    size = 3 + scatter.modulus
     tau = jnp.maximum(at.tau, LEAST_SPREAD)
     modulus = jnp.maximum(at.modulus_scatter, LEAST_SPREAD)
     mean_zero, sd_zero = settings.zero_prior

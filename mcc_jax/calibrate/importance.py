@@ -8,8 +8,7 @@ distribution around the mode are weighted,
 
 and one distribution more is fitted to all weighted draws, q the mixture of all so far, until the weights' Pareto k and
 effective size say that they are good enough (adaptive multiple importance sampling, Cornuet et al. 2012; Vehtari et al.
-2024). If they never do, NUTS has to run. The density by itself takes a quarter of the sampler's time to compile, and
-all draws are worked on side by side.
+2024). If they never do, NUTS has to run, which takes four times as long to compile.
 """
 
 from __future__ import annotations
@@ -49,35 +48,28 @@ PROPOSED = 1.5
 class Weighted(NamedTuple):
     """Draws of the population by importance resampling, in unbounded coordinates and as populations, chains in a row.
 
-    `log_evidence` is the logarithm of the integral of the density, of the mean weight, and `error` its standard error.
+    `good` says whether their weights are good enough, `log_evidence` is the logarithm of the density's integral, of the
+    mean weight, and `error` its standard error.
     """
 
     free: np.ndarray
     population: Population
-    log_evidence: float
-    error: float
+    good: bool
+    log_evidence: float = np.nan
+    error: float = np.inf
 
 
 def sample_weighted(
-    key: Array,
-    mode: Array,
-    covariance: Array,
-    target: LogPosterior,
-    *,
-    chains: int,
-    draws: int,
-    many: bool = False,
-    allow_bad_weights: bool = False,
-) -> Weighted | None:
-    """Draws of the population by importance resampling; None if the weights are not good enough.
+    key: Array, mode: Array, covariance: Array, target: LogPosterior, *, chains: int, draws: int, many: bool = False
+) -> Weighted:
+    """Draws of the population by importance resampling; of the first proposal alone if no weights are good enough.
 
     A spread's coordinate may have either sign for the same spread: proposals and draws are folded to positive ones.
 
     Args:
         mode, covariance: of the population in unbounded coordinates.
-        chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
+        chains, draws: shape of what is returned; each chain is resampled from its own proposals.
         many: propose no more than is kept: a density is expensive.
-        allow_bad_weights: give the draws of the first round whatever their weights.
     """
     from scipy.special import logsumexp
 
@@ -85,40 +77,38 @@ def sample_weighted(
     trial = min(TRIAL // 4, kept) if many else TRIAL
     mixture = _Mixture(np.asarray(jax.random.key_data(key)), target)
     centre, width = mixture.folded(np.array(mode)), np.asarray(covariance)
+    first: Any = None
     for turn in range(ROUNDS):
         mixture.propose(centre, width, trial)
-        free, log_weight = mixture.free, mixture.log_weight
-        if allow_bad_weights:
-            finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
-            weight = np.exp(finite - finite.max()) if np.isfinite(finite).any() else np.ones(len(finite))
-            return Weighted(*_resampled(free, weight / weight.sum(), target, chains, draws), np.nan, np.inf)
-        weight, k = smoothed_weights(log_weight)
+        first = first or (mixture.free, mixture.log_weight)
+        weight, k = smoothed_weights(mixture.log_weight)
         share = effective_share(weight)
         last = turn == ROUNDS - 1
-        if k <= MOST_PARETO_K and (share >= GOOD_SHARE or share * len(free) >= kept or last):
+        if k <= MOST_PARETO_K and (share >= GOOD_SHARE or share * len(weight) >= kept or last):
             total = kept if many else min(math.ceil(PROPOSED * kept / share), ROUNDS * trial)
-            if total > len(free):
-                mixture.propose(centre, width, total - len(free))
-                free, log_weight = mixture.free, mixture.log_weight
-                weight, k = smoothed_weights(log_weight)
+            if total > len(weight):
+                mixture.propose(centre, width, total - len(weight))
+                weight, k = smoothed_weights(mixture.log_weight)
                 share = effective_share(weight)
-            if k <= MOST_PARETO_K and share * len(free) >= LEAST:
-                value = float(cast(Any, logsumexp(log_weight))) - math.log(len(log_weight))
+            if k <= MOST_PARETO_K and share * len(weight) >= LEAST:
+                value = float(cast(Any, logsumexp(mixture.log_weight))) - math.log(len(weight))
                 error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
-                return Weighted(*_resampled(free, weight, target, chains, draws), value, error)
+                return Weighted(*_resampled(mixture.free, weight, target, chains, draws), True, value, error)
         if turn == 0:
-            # What all particles share is the narrower the smaller a spread is: a funnel, into which more narrow
+            # The population parameters are known the better the smaller a spread is: a funnel, into which narrower
             # distributions reach, each around the most probable population at one value of a spread.
             for place in target.signed():
                 for centre, width in _along(place, np.array(mode), np.asarray(covariance), target):
                     mixture.propose(mixture.folded(centre), width, trial // PARTS)
-            log_weight, free = mixture.log_weight, mixture.free
-        weight = _tempered(log_weight, ENOUGH * len(mode))
+        weight = _tempered(mixture.log_weight, ENOUGH * len(mode))
         if weight is None:
-            return None
-        centre = weight @ free
-        width = (free - centre).T @ (weight[:, None] * (free - centre))
-    return None
+            break
+        centre = weight @ mixture.free
+        width = (mixture.free - centre).T @ (weight[:, None] * (mixture.free - centre))
+    free, log_weight = first
+    finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+    weight = np.exp(finite - finite.max()) if np.isfinite(finite).any() else np.ones(len(finite))
+    return Weighted(*_resampled(free, weight / weight.sum(), target, chains, draws), False)
 
 
 def _along(
@@ -279,33 +269,30 @@ def relative_scatter(log_weight: np.ndarray) -> np.ndarray:
 
 
 def smoothed(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Pareto-smoothed log weights that add up to 1, and k; of a tail that is all alike unsmoothed, and infinite."""
+    """Pareto-smoothed log weights that add up to 1, and their k: infinite, and unsmoothed, where no tail can be fitted,
+    0 where all are equal."""
     from arviz_stats.base.array import array_stats
 
+    finite = np.where(np.isfinite(log_weight), log_weight, -1e10)
+    if np.std(finite) <= 1e-9:
+        return np.full(len(finite), -np.log(len(finite))), 0.0
     with np.errstate(all="ignore"), contextlib.suppress(ValueError):
-        found, k = array_stats.psislw(-log_weight, axis=-1)  # of log likelihoods, whose weights are their inverse
-        return np.asarray(found), float(k)
-    return log_weight - np.logaddexp.reduce(log_weight), np.inf
+        found, k = array_stats.psislw(-finite, axis=-1)  # of log likelihoods, whose weights are their inverse
+        if np.isfinite(found).all():  # else one weight has everything
+            return np.asarray(found), float(k) if np.isfinite(k) else np.inf
+    return finite - np.logaddexp.reduce(finite), np.inf
 
 
 def pareto_k(log_weight: np.ndarray) -> np.ndarray:
     """Pareto k of importance weights, draws along the first axis."""
-    columns = np.where(np.isfinite(log_weight), log_weight, -1e10).T
-    # Weights that are all equal have no tail to fit.
-    result = np.array([smoothed(one)[1] if np.std(one) > 1e-9 else 0.0 for one in columns])
-    return np.where(np.isnan(result), np.inf, result)
+    return np.array([smoothed(one)[1] for one in log_weight.T])
 
 
 def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
     """Pareto-smoothed importance weights, normalised, and their k."""
-    finite_weight = np.where(np.isfinite(log_weight), log_weight, -1e10)
-    if np.std(finite_weight) <= 1e-9:
-        return np.full(len(finite_weight), 1 / len(finite_weight)), 0.0
-    smooth, k = smoothed(finite_weight)
-    if not np.isfinite(smooth).all():  # one weight holds all: nothing to smooth
-        smooth, k = finite_weight, np.inf
+    smooth, k = smoothed(log_weight)
     weight = np.exp(np.maximum(smooth - np.max(smooth), -700.0))
-    return weight / weight.sum(), k if np.isfinite(k) else float("inf")
+    return weight / weight.sum(), k
 
 
 def effective_share(weight: np.ndarray) -> float:

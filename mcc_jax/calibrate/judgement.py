@@ -20,8 +20,8 @@ from ..campaign.findings import named
 from ..campaign.plausibility import add_likely_unit_error
 from .mode import Fit
 
-MODULUS_OPEN = "unknown modulus"
-"""The `check` of the finding that the tests leave the modulus open."""
+MODULUS_OPEN = "unknown modulus"  # the `check` of the finding that the tests leave the modulus open
+UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
 
 # Found by trial on simulated campaigns.
 # The law describes tests badly that it misses by this share of their range of displacement with every particle's own
@@ -67,20 +67,17 @@ def noise_note(share: float, by: str) -> str | None:
 
 
 def noise_share(fit: Fit) -> float:
-    """Share of the variance that is left of the residuals which the fit holds for correlated noise [-].
+    """Share of the residual variance that the fit attributes to correlated noise [-].
 
-    White noise of read-out and force does not repeat from one reading to the next; what is correlated along a test and
-    no smaller than it is, is rather what the law misses.
+    Read-out and force noise is white: what is correlated along a test and no smaller is rather what the law misses.
     """
     variance, correlated = _variances(fit)
     return float(np.median(correlated / variance))
 
 
 def at_noise_level(fit: Fit, rms_um: np.ndarray) -> bool:
-    """Whether what the law misses, `rms_um` of every particle, is mostly white noise of read-out and force.
-
-    Correlated noise and a common factor on the noise, which grow with a misfit, do not count.
-    """
+    """Whether what the law misses, `rms_um` of every particle, is mostly white noise of read-out and force: correlated
+    noise and a common factor on the noise, which grow with a misfit, do not count."""
     variance, correlated = _variances(fit)
     return bool(np.median((1 - CORRELATED_SHARE) * rms_um**2 - (variance - correlated)) <= 0)
 
@@ -115,11 +112,8 @@ def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray
 
 
 def unknown_modulus(campaign: Campaign, modulus: Mapping[str, Any]) -> Finding | None:
-    """That the tests leave the modulus open, and why; None if they determine it, or the method gives no error.
-
-    `modulus` has value, sd and interval_95 [MPa].
-    """
-    if not told_by_no_test(modulus):
+    """That the tests leave the modulus [MPa] open, and why; None if they determine it, or the method gives no error."""
+    if not is_unknown(modulus):
         return None
     interval = modulus.get("interval_95")
     between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"
@@ -132,7 +126,7 @@ def unknown_modulus(campaign: Campaign, modulus: Mapping[str, Any]) -> Finding |
     return Finding(MODULUS_OPEN, "warning", f"The tests do not tell the modulus{between}{why}", remedy)
 
 
-def told_by_no_test(modulus: Mapping[str, Any]) -> bool:
+def is_unknown(modulus: Mapping[str, Any]) -> bool:
     """Whether an estimate of the modulus is so wide that it says nothing; not where the method gives no error."""
     value, sd = modulus["value"], modulus["sd"]
     return value is not None and sd is not None and sd >= UNKNOWN * abs(value)
@@ -141,9 +135,6 @@ def told_by_no_test(modulus: Mapping[str, Any]) -> bool:
 def modulus_is_open(content: Mapping[str, Any]) -> bool:
     """Whether the tests leave the modulus open, from the findings of a `calibration.json`."""
     return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
-
-
-UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
 
 
 def _far(logs: np.ndarray) -> np.ndarray:
@@ -175,27 +166,31 @@ def judged(
     found += check_plausibility(campaign, modulus_MPa=value)
     if again is None:
         return tuple(found)
+
+    def without(names: tuple[str, ...]) -> str:
+        it = "it" if len(names) == 1 else "them"
+        try:
+            return f"without {it} {_answer(again(campaign.without(*names)))}, with {it} {_answer(answer)}"
+        except InputError as error:
+            return f"without {it} there is no answer ({error.problem})"
+
     answers: dict[tuple[str, ...], str] = {}
     findings = []
     for one in found:
-        count = len(one.particles)
-        some = FEW * len(campaign) <= count <= len(campaign) / 2 and count > 0
-        if one.level != "info" and some and len(campaign) - count >= LEAST_LEFT:
-            if one.particles not in answers and len(answers) < ANSWERS:
-                answers[one.particles] = _without(campaign, answer, one.particles, again)
-            other = answers.get(one.particles)
-            one = one if other is None else replace(one, sentence=f"{one.sentence}; {other}")
+        names, left = one.particles, len(campaign) - len(one.particles)
+        some = len(names) >= max(1, FEW * len(campaign)) and left >= max(LEAST_LEFT, len(names))
+        if one.level != "info" and some:
+            if names not in answers and len(answers) < ANSWERS:
+                answers[names] = without(names)
+            if names in answers:
+                one = replace(one, sentence=f"{one.sentence}; {answers[names]}")
         findings.append(one)
     return tuple(findings)
 
 
 @contextlib.contextmanager
 def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
-    """Turn what linear algebra says of numbers beyond its reach into one line that a person can act on.
-
-    Raises:
-        InputError: in place of a matrix that is singular or not finite.
-    """
+    """Raise `InputError`, a line that a person can act on, in place of errors about singular or infinite matrices."""
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
@@ -215,33 +210,13 @@ def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
         raise InputError(problem, file=campaign.source or None, remedy=remedy) from None
 
 
-def _without(
-    campaign: Campaign,
-    content: Mapping[str, Any],
-    names: tuple[str, ...],
-    again: Callable[[Campaign], Mapping[str, Any]],
-) -> str:
-    it = "it" if len(names) == 1 else "them"
-    try:
-        other = again(campaign.without(*names))
-    except InputError as error:
-        return f"without {it} there is no answer ({error.problem})"
-    return f"without {it} {_answer(other)}, with {it} {_answer(content)}"
-
-
 def _answer(content: Mapping[str, Any]) -> str:
-    parts = []
-    modulus = content["effective_modulus_MPa"]
-    if modulus["value"] is None or told_by_no_test(modulus):
-        parts.append("the modulus is unknown")
-    else:
-        parts.append(f"the modulus is {_pair(modulus, 1e-3)} GPa")
-    parts.append(f"a {_pair(content['a'])}")
-    return " and ".join(parts) + ("" if content.get("converged", True) else " (not converged)")
+    def pair(estimate: Mapping[str, Any], factor: float = 1.0) -> str:
+        value, sd = estimate["value"], estimate["sd"]
+        if value is None:
+            return "unknown"
+        return f"{factor * value:.4g}" + ("" if sd is None else f" +- {factor * sd:.2g}")
 
-
-def _pair(estimate: Mapping[str, Any], factor: float = 1.0) -> str:
-    value, sd = estimate["value"], estimate["sd"]
-    if value is None:
-        return "unknown"
-    return f"{factor * value:.4g}" + ("" if sd is None else f" +- {factor * sd:.2g}")
+    modulus, end = content["effective_modulus_MPa"], "" if content.get("converged", True) else " (not converged)"
+    known = modulus["value"] is not None and not is_unknown(modulus)
+    return f"the modulus is {f'{pair(modulus, 1e-3)} GPa' if known else 'unknown'} and a {pair(content['a'])}{end}"

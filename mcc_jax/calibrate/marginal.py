@@ -37,18 +37,15 @@ from .population import Population, Scatter, moments, particles_at
 from .small_matrices import Cholesky, eliminate
 from .straightening import Straight, coordinates
 
-FARTHEST = 4.0
-"""Exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test."""
-
-MIN_SHARE = 0.05
-"""A coefficient of the polynomial is not drawn below this share of its most probable value."""
+FARTHEST = 4.0  # exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test
+MIN_SHARE = 0.05  # a coefficient of the polynomial is not drawn below this share of its most probable value
 
 
 class Marginal(eqx.Module):
     r"""The tests around a point, zeros integrated out.
 
-    With u the numbers (kappa, amplitudes and further numbers in the coordinates of `straightening`, and the products of
-    these by which a law with effects bends), the log likelihood of a test is
+    With u a particle's coordinates (kappa, the effects' parameters as in `straightening`, and products of these, to the
+    second order in effects), the log likelihood of a test is
 
     .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
 
@@ -85,7 +82,7 @@ class Marginal(eqx.Module):
         return each if self.weight is None else self.weight * each
 
     def place(self, population: Population, xi: Float[Array, "particles k"]) -> Placed:
-        """Numbers u of all particles at deviations xi, and their derivatives."""
+        """Coordinates u of all particles at deviations xi, and their derivatives."""
         at = particles_at(population, self.flatness, self.scatter, xi)
         u, slope = straighten(at.latent - self.point.latent)
         jacobian = slope[..., None] * at.factor
@@ -103,10 +100,10 @@ class Marginal(eqx.Module):
 
     def stretch(self, population: Population) -> Float[Array, " k"]:
         r""":math:`j \tau_j` of every deviation, by which what it moves bends; 0 where it moves in a straight line."""
-        bends = [jnp.array([1.0, 3.0, 5.0]) * population.tau, jnp.zeros(self.scatter.of_latent - 3)]
-        for j, (_, signed) in enumerate(self.scatter.varying):
-            bends.append(jnp.zeros(1) if signed else population.theta_scatter[j : j + 1])
-        return jnp.concatenate(bends)
+        signed = np.array([signed for _, signed in self.scatter.varying], bool)
+        amplitudes = jnp.where(signed, 0.0, population.theta_scatter)
+        straight = jnp.zeros(self.scatter.of_latent - 3)
+        return jnp.concatenate([jnp.array([1.0, 3.0, 5.0]) * population.tau, straight, amplitudes])
 
     def laplace(self, population: Population) -> Laplace:
         """Integrate every particle's deviations out by Laplace's method."""
@@ -183,8 +180,8 @@ class Marginal(eqx.Module):
 def with_products(
     u: Float[Array, "particles u"], jacobian: Float[Array, "particles u k"]
 ) -> tuple[Float[Array, "particles q"], Float[Array, "particles q k"]]:
-    """Numbers and what they bend by: the product of each of an effect's numbers with all numbers, half of it where both
-    are an effect's, in the order of `Linear.bends`; and the derivatives."""
+    """Coordinates with their products: of each of an effect's with all, half of it where both are an effect's, in the
+    order of `Linear.bends`; and the derivatives."""
     half = jnp.concatenate([jnp.ones(4), jnp.full(u.shape[1] - 4, 0.5)])[None]
     own, own_slope = u[:, 4:], jacobian[:, 4:]
     products = own[:, :, None] * (half * u)[:, None, :]
@@ -196,10 +193,7 @@ def with_products(
 
 
 class Placed(NamedTuple):
-    """Where particles are: their latent vector w and numbers of effects, and u, the difference from the point.
-
-    u is in the coordinates of the Gram matrix, `jacobian` its derivatives by the deviations.
-    """
+    """Particles' latent vector w, parameters of effects, coordinates u, and derivatives of u by the deviations."""
 
     latent: Float[Array, "particles 4"]
     theta: Float[Array, "particles numbers"]
@@ -208,10 +202,10 @@ class Placed(NamedTuple):
 
 
 class Laplace(eqx.Module):
-    r"""Most probable deviations of all particles given the population, and the curvature there.
+    r"""Most probable deviations of all particles given the population, and each test's integrated log likelihood.
 
-    The curvature is in straightened coordinates nu, :math:`\xi_j = \hat\xi_j + \log(1 + j\tau_j\nu_j)/(j\tau_j)`, with
-    :math:`j \tau_j` in `stretch`. `log_likelihood` is that of each test, integrated.
+    The curvature is in coordinates nu, :math:`\xi_j = \hat\xi_j + \log(1 + j\tau_j\nu_j)/(j\tau_j)`, with
+    :math:`j \tau_j` in `stretch`.
     """
 
     deviations: Float[Array, "particles k"]
@@ -222,10 +216,10 @@ class Laplace(eqx.Module):
 
 
 class ParticleDraw(NamedTuple):
-    """One draw of all particles given the population: w, numbers of effects, zeros [um], and deviations xi.
+    """One draw of all particles given the population: w, parameters of effects, zeros [um], deviations xi.
 
-    `log_volume` is the log of the volume by which the map from standard normal numbers to xi and zero stretches, minus
-    infinity outside its range; `log_likelihood` that of each test, integrated.
+    `log_volume` is the log determinant of the map from standard normal numbers to xi and zero, minus infinity outside
+    its range; `log_likelihood` that of each test, integrated.
     """
 
     latent: Float[Array, "particles 4"]
@@ -238,18 +232,15 @@ class ParticleDraw(NamedTuple):
 
 def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"], Float[Array, "*batch 4"]]:
     """kappa, in which stress is linear, and its derivative, from w less the point's."""
-    powers = jnp.array([1.0, 3.0, 5.0])
-    powers = jnp.broadcast_to(powers, away[..., :3].shape)
+    powers = jnp.broadcast_to(jnp.array([1.0, 3.0, 5.0]), away[..., :3].shape)
     exponent = jnp.clip(powers * away[..., :3], -FARTHEST, FARTHEST)
     kappa = jnp.concatenate([jnp.expm1(exponent) / powers, away[..., 3:]], -1)
     return kappa, jnp.concatenate([jnp.exp(exponent), jnp.ones_like(away[..., 3:])], -1)
 
 
 class Summaries(NamedTuple):
-    """What `summarise` gives: the tests summarised, and the noise, noise of force turned into noise of displacement.
-
-    `white` is the effective standard deviation [um]: white noise of it would weigh a test as much as its noise does.
-    """
+    """The tests summarised, the filters of their noise, and its effective standard deviation [um]: white noise of that
+    size would weigh a test as much."""
 
     marginal: Marginal
     filters: Whitening
@@ -268,10 +259,9 @@ def summarise(
     correlation: Correlation,
     along: Along,
 ) -> Summaries:
-    """Summarise all tests around a point by Gauss-Newton curvature.
+    """Summarise all tests around a point by Gauss-Newton curvature, from the derivatives in the coordinates `straight`.
 
-    `linear` has the derivatives in the coordinates `straight`; `zero_prior` is the zeros' distance from the recorded
-    contact, mean and standard deviation [um].
+    `zero_prior` is that of the zeros' distance from the recorded contact, mean and standard deviation [um].
     """
 
     def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:
@@ -317,14 +307,12 @@ def summarise(
 
 
 def _snap_evidence(latent, particle, force, used):
-    """What a jump says that no residual does: that the curve's peak lies between the two forces around it.
+    """Evidence of a jump that no residual has: the curve's peak lies between the two forces around it.
 
     The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point of the
-    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, takes its place.
-
-    Returns:
-        Derivative of that logarithm by the latent vector, distance of the interval's middle from it, and its precision:
-        zero unless the test shows a jump.
+    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, takes its place:
+    returned are the derivative of that logarithm by the latent vector, the distance of the interval's middle from it,
+    and its precision, zero unless the test shows a jump.
     """
     value, slope = jax.value_and_grad(snap)(latent, particle)
     at = jnp.where(jnp.isfinite(value), jnp.exp(jnp.where(jnp.isfinite(value), value, 0.0)), jnp.inf)

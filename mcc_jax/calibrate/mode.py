@@ -4,7 +4,7 @@ mode, the particles that it expects; and the fit at that mode, from which sample
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-import numpyro.distributions as dist
 import numpyro.handlers
 from jaxtyping import Array, Bool, Float, Int
 from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
@@ -88,6 +87,12 @@ class LogPosterior(eqx.Module):
         """Log density given all tests, with its constant."""
         with standard_promotion():
             potential: Any = potential_energy(self.model, (None, self.marginal), {}, self.sites(free))
+            return -potential
+
+    def log_prior(self, free: Float[Array, " d"]) -> Scalar:
+        """Log density of the population before the tests."""
+        with standard_promotion():
+            potential: Any = potential_energy(self.model.population, (self.marginal,), {}, self.sites(free))
             return -potential
 
     def population(self, free: Float[Array, " d"]) -> Population:
@@ -356,9 +361,12 @@ class Fit(eqx.Module):
         """
         from numpyro.infer import NUTS, init_to_value
 
-        size = len(self.names) + explicit * len(self.tests) * (self.marginal.scatter.size + 1)
-        start = init_to_value(values={"coordinates": jnp.zeros(size)})
-        return NUTS(FitCoordinates(self, size), **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
+        from .draws import FitCoordinates
+
+        coordinates = FitCoordinates(self, explicit)
+        start = init_to_value(values={"coordinates": jnp.zeros(coordinates.size)})
+        model = partial(FitCoordinates.numpyro_model, coordinates)
+        return NUTS(model, **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
 
     def first(self, count: int) -> Fit:
         """The same of the first `count` particles: without padding."""
@@ -378,28 +386,3 @@ class Fit(eqx.Module):
             residual=self.residual[:count],
             marginal=marginal,
         )
-
-
-class FitCoordinates:
-    """The model in the coordinates of a fit, as a NumPyro model: its density, written in numbers that are near standard
-    normal, since widths that span five powers of ten do not mix; every site of the model is a `deterministic`."""
-
-    def __init__(self, fit: Fit, size: int) -> None:
-        self.fit, self.size = fit, size
-
-    def __call__(self, tests: Tests, marginal: Marginal | None = None) -> None:
-        """As `Model`: with `marginal` every particle is integrated out, else its own numbers are explicit."""
-        fit, improper = self.fit, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
-        position: Any = numpyro.sample("coordinates", improper)
-        d = len(fit.names)
-        free = fit.mode + jnp.linalg.cholesky(fit.covariance) @ position[:d]
-        sites = fit.target.sites(free)
-        options = {} if marginal is not None else {"filters": fit.filters, "around": fit.marginal}
-        if marginal is None:
-            sites["own"] = position[d:].reshape(len(tests), -1)
-        with handlers.block():  # the model is evaluated here, and adds no sites of its own
-            potential: Any = potential_energy(fit.model, (tests, marginal), options, sites)
-            values = constrain_fn(seeded(fit.model), (tests, marginal), options, sites, return_deterministic=True)
-        numpyro.factor("density", -potential)
-        for name, value in values.items():
-            numpyro.deterministic(name, value)

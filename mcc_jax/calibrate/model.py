@@ -49,8 +49,7 @@ class Model:
         along: what they are correlated along, the path of force or time.
         robust: white noise is Student's with 4 degrees of freedom, so that spikes count for little.
 
-    Raises:
-        InputError: for an unknown form (which may be given as its text), or what is no `Priors` and no effect.
+    Forms may be given as their text.
     """
 
     unloading: Unloading
@@ -81,11 +80,10 @@ class Model:
     ) -> None:
         chosen = tuple(_variant(one) for one in _several(effects))
         names = [v.mechanism for v in chosen]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise InputError(f"{twice[0]} stands twice in one model", remedy="Take one formula of each mechanism.")
-        own = [v.mechanism for v in chosen if v.random_per_test]
-        differ = tuple(dict.fromkeys([*_several(varying), *own]))
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"{name} stands twice in one model", remedy="Take one formula of each mechanism.")
+        differ = tuple(dict.fromkeys([*_several(varying), *(v.mechanism for v in chosen if v.random_per_test)]))
         for name in differ:
             arguments.choice(name, names, "effect to vary")
         fields = {
@@ -105,46 +103,31 @@ class Model:
 
     # ---- the model ---------------------------------------------------------------------------------------------------
 
-    def __call__(
-        self,
-        tests: Tests | None,
-        marginal: Marginal | None = None,
-        *,
-        filters: Whitening | None = None,
-        around: Marginal | None = None,
-    ) -> None:
+    def __call__(self, tests: Tests | None, marginal: Marginal | None = None) -> None:
         """Displacement under measured force, of particles of one material.
 
         Args:
             tests: the measurements; `tests.unobserved()` to predict them.
             marginal: of a fit: particles are integrated out, and the tests themselves are not looked at.
-            filters: of a fit: the noise as it was estimated, but for a common factor; sampled if None.
-            around: of a fit: every particle's own numbers are sampled in the coordinates of its Laplace approximation.
         """
         if marginal is not None:
             numpyro.factor("tests", jnp.sum(marginal.log_likelihood(self.population(marginal))))
             return
         assert tests is not None
-        p, count, size = self.chosen_priors, len(tests), self.scatter.size
-        population = self.population(tests, noise_factor=filters is not None)
-        noise = None if filters is not None else self._noise(count)
+        p, count = self.chosen_priors, len(tests)
+        population, noise = self.population(tests, noise_factor=False), self._noise(count)
         with numpyro.plate("particle", count):
-            if around is None:
-                xi = sample("deviation", dist.Normal().expand([size]).to_event(1))  # not centred: a spread may be 0
-                zero = sample("zero_um", dist.Normal(tests.contact + p.zero_um.mean, p.zero_um.sd))
-            else:
-                xi, zero = self._around(population, tests, around)
+            xi = sample("deviation", dist.Normal().expand([self.scatter.size]).to_event(1))  # not centred: tau may be 0
+            zero = sample("zero_um", dist.Normal(tests.contact + p.zero_um.mean, p.zero_um.sd))
             own = particles_at(population, tests.flatness, self.scatter, xi)
-            eta = 1 + population.a * tests.flatness
-            deterministic("C", jnp.exp(own.latent[:, :3]) / eta[:, None])
+            deterministic("C", coefficients(own.latent, population, tests.flatness))
             law = jax.vmap(self.forms.displacement)
             clean = law(own.latent, own.theta, tests.particle, tests.record)
-            if noise is not None and self.robust:
+            if self.robust:
                 # Normal noise whose precision is gamma distributed from reading to reading is Student's.
                 gamma = dist.Gamma(FREEDOM / 2, FREEDOM / 2).expand([tests.force.shape[1]]).to_event(1)
                 tests = dataclasses.replace(tests, reading_weight=sample("reading_weight", gamma))
-            if noise is not None:
-                filters = self._filters(noise, Point(own.latent, zero, own.theta), tests)
+            filters = self._filters(noise, Point(own.latent, zero, own.theta), tests)
             observed = RecordNoise(clean + zero[:, None], filters, jnp.exp(population.log_noise))
             sample("displacement_um", observed, obs=tests.displacement)
 
@@ -187,7 +170,7 @@ class Model:
         return Population(a, log_modulus, mu, tau, modulus_scatter, shape_scatter, log_noise, theta, theta_scatter)
 
     def _effects(self) -> tuple[Float[Array, " numbers"], Float[Array, " varying"]]:
-        """Amplitudes on their physical side, further numbers within what is plausible, spreads of those that vary."""
+        """Amplitudes on their physical side, further parameters, spreads of the amplitudes that vary."""
         amplitudes, further, spreads = [], [], []
         for v in self.effects:
             size = sample(f"{v.mechanism}_size", Amplitude(v))
@@ -199,25 +182,13 @@ class Model:
         theta = jnp.concatenate([none, *(jnp.reshape(x, 1) for x in (*amplitudes, *further))])
         return theta, jnp.concatenate([none, *(jnp.reshape(x, 1) for x in spreads)])
 
-    def _around(self, population: Population, tests: Tests, around: Marginal) -> tuple[Array, Array]:
-        """Every particle's own numbers, sampled as standard normal ones; the density is that of the plain model."""
-        size, prior = self.scatter.size, self.chosen_priors.zero_um
-        normal = sample("own", dist.Normal().expand([size + 1]).to_event(1))
-        drawn = around.draw(population, normal[:, :size], normal[:, size])
-        zero = deterministic("zero_um", drawn.zero)
-        plain = jnp.sum(dist.Normal().log_prob(drawn.deviations), -1)
-        plain += dist.Normal(tests.contact + prior.mean, prior.sd).log_prob(zero) + drawn.log_volume
-        numpyro.factor("coordinates", plain - jnp.sum(dist.Normal().log_prob(normal), -1))
-        return drawn.deviations, zero
-
     def _noise(self, count: int) -> Noise:
         """White noise in displacement and in force, correlated noise along the path; all particles alike."""
         p = self.chosen_priors
         names = ("noise_displacement_um", "noise_force_mN", "noise_correlated_um", "noise_length")
         priors = ((name, getattr(p, name)) for name in names)
-        numbers = [sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors]
-        displacement, force, correlated, length = numbers
-        return Noise(displacement, force, correlated, length, jnp.ones(count))
+        four = (sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors)
+        return Noise(*four, jnp.ones(count))
 
     def _filters(self, noise: Noise, point: Point, tests: Tests) -> Whitening:
         """The noise as displacement: how noise of force moves the prediction is taken as known."""
@@ -264,8 +235,8 @@ class Model:
         return {v.mechanism: k for k, v in enumerate(self.effects) if v.mechanism in self.varying}
 
     def spread_prior(self, variant: Variant) -> NakagamiPrior:
-        """Prior of how much an amplitude differs between particles: in the logarithm, or in its own unit where it may
-        have either sign. Open in its order of magnitude."""
+        """Prior of how much an amplitude differs between particles, open in its order of magnitude: in the logarithm,
+        or in its unit where it may have either sign."""
         return NakagamiPrior(variant.plausible[1] if self._signed(variant) else 0.5, shape=0.25)
 
     @staticmethod
@@ -283,17 +254,17 @@ class Model:
 
         Args:
             effects: each by name, "mechanism" or "mechanism:variant", of `mcc_jax.effects.LIBRARY`, or a `Variant`.
-            varying: mechanisms whose amplitude differs from particle to particle, also of effects there are.
+            varying: mechanisms whose amplitude differs from particle to particle, also of effects that it has.
 
         Raises:
-            InputError: for a name that does not exist, naming those that do; for two formulas of one mechanism.
+            InputError: for an unknown name, with those that exist; for two formulas of one mechanism.
         """
         new = tuple(_variant(one) for one in effects)
         return dataclasses.replace(self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying)))
 
 
 class RecordNoise(dist.Distribution):
-    """Displacements of whole tests around a prediction [um]: one event is one test, log likelihoods are by particle."""
+    """Displacements of whole tests around a prediction [um]; one event is one test."""
 
     arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
     support: Any = constraints.real_vector
@@ -303,12 +274,12 @@ class RecordNoise(dist.Distribution):
         super().__init__(batch_shape=loc.shape[:1], event_shape=loc.shape[1:])
 
     def log_prob(self, value: Any, intermediates: Any = None) -> Any:
-        """Log density of every test; points that do not count carry nothing."""
+        """Log density of every test."""
         away = jnp.where(self.filters.mask, value - self.loc, 0.0)
         return jax.vmap(lambda f, one: f.log_density(one, jnp.log(self.factor)))(self.filters, away)
 
     def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
-        """Draws; points that do not count are NaN, as ArviZ wants ragged data."""
+        """Draws; points that do not count are NaN."""
         count, points = self.loc.shape
 
         def one(key: Any) -> Array:
@@ -320,6 +291,11 @@ class RecordNoise(dist.Distribution):
 
         keys = jax.random.split(key, math.prod(sample_shape))
         return jax.vmap(one)(keys).reshape(*sample_shape, count, points)
+
+
+def coefficients(latent: Array, population: Population, flatness: Array) -> Array:
+    """C1, C3, C5 of particles, without their shape factors."""
+    return jnp.exp(latent[:, :3]) / (1 + population.a * flatness)[:, None]
 
 
 def spread(name: str, prior: NakagamiPrior) -> Scalar:

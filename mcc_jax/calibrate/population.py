@@ -22,14 +22,12 @@ class Population(eqx.Module):
     Attributes:
         a: shape parameter [-].
         log_modulus: logarithm of the effective modulus in MPa.
-        mu: means of log C1, log C3, log C5.
-        tau: their standard deviations, >= 0.
-        modulus_scatter: standard deviation of the log modulus over the particles.
-        shape_scatter: standard deviation of `a` over the particles; to first order in it.
+        mu, tau: means and standard deviations of log C1, log C3, log C5 over the particles.
+        modulus_scatter, shape_scatter: standard deviations of the log modulus and of `a`, to first order.
         log_noise: logarithm of a factor on all noise.
-        theta: numbers of the effects: amplitudes, then further numbers.
-        theta_scatter: how much the amplitudes that differ from particle to particle do: standard deviation of their
-            logarithm, or of themselves where both signs are physical.
+        theta: parameters of the effects: amplitudes, then further ones.
+        theta_scatter: standard deviation of the logarithm of each amplitude that differs from particle to particle, or
+            of the amplitude itself where both signs are physical.
     """
 
     a: Scalar
@@ -46,11 +44,9 @@ class Population(eqx.Module):
 class Scatter(eqx.Module):
     """How particles differ, and with how many Newton steps they are integrated out.
 
-    Attributes:
-        modulus, shape: whether the modulus, and `a`, differ.
-        power: power with which the shape factor enters unloading.
-        varying: of each amplitude that differs its place, and whether both signs are physical.
-        positive: of each of the effects' numbers that must be positive its place, and that of its amplitude.
+    `power` is that with which the shape factor enters unloading. `varying` has the place of each amplitude that differs
+    and whether both signs are physical, `positive` the place of each effect parameter that must be positive and that
+    of its amplitude.
     """
 
     modulus: bool = eqx.field(static=True, default=False)
@@ -90,7 +86,7 @@ def moments(
 
 
 class Particles(eqx.Module):
-    """Particles at their deviations from the population: b1, b3, b5, e and the numbers of their effects.
+    """Particles at their deviations from the population: b1, b3, b5, e and the parameters of their effects.
 
     `factor` and `slope` are the derivatives of the former and of the amplitudes that vary by the deviations.
     """
@@ -104,7 +100,7 @@ class Particles(eqx.Module):
 def particles_at(
     population: Population, flatness: Float[Array, " particles"], scatter: Scatter, xi: Float[Array, "particles size"]
 ) -> Particles:
-    """Every particle's numbers, from its standard normal deviations."""
+    """Every particle's parameters, from its standard normal deviations."""
     mean, factor = moments(population, flatness, scatter)
     own = scatter.of_latent
     latent = mean + jnp.einsum("npk,nk->np", factor, xi[:, :own])

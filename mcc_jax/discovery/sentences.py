@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from .._format import interval, listed, plain, with_sd
-from ..calibrate.judgement import told_by_no_test
+from ..calibrate.judgement import is_unknown
 from .settings import AT_PEAKS, DECISIONS, ENOUGH, WITHIN
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def summary_of(found: Discovery) -> str:
 def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
     """What the addition did to the modulus: to that at the peaks, where formulas of the modulus take it elsewhere."""
     own, now, was = after["effective_modulus_MPa"], after[AT_PEAKS], before[AT_PEAKS]
-    if told_by_no_test(now):
+    if is_unknown(now):
         return f"With it these tests do not tell the effective modulus (95 % interval {interval(now, 1e-3)} GPa)."
     where = "" if own["value"] == now["value"] else " at the peaks of these tests"
     return f"With it the effective modulus{where} is {with_sd(now, 1e-3)} GPa instead of {with_sd(was, 1e-3)} GPa."
