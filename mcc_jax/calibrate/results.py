@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
@@ -158,7 +158,7 @@ class JointCalibration(Calibration):
         """Root mean square residual of every particle [um], shape (N,)."""
         return root_mean_squares(self.selection.tests, self.residual())
 
-    def judged(self, started: float, again: Callable[[Campaign], Mapping[str, Any]] | None) -> Self:
+    def judged(self, started: float, again: Callable[[Campaign], Mapping[str, Any]] | None) -> Any:
         """The same with findings, see `judgement.judged`, and the time it took since it was started."""
         outlying = unlike_others(self.particles, self.rms_um(), ranges_um(self.selection.tests))
         findings = judged(self.campaign, self.answer(), outlying, again)
