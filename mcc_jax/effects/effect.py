@@ -13,8 +13,7 @@ from .._format import value_of
 from .._types import Scalar, Values, scalar
 from ..formulas import Formulas
 from ..geometry import Particle
-from .context import Context
-from .record import Record
+from .record import Context, Record
 
 Factors = tuple[Values, Values, Values]
 MIN_FACTOR = 0.05
@@ -24,38 +23,39 @@ MIN_FACTOR = 0.05
 class AbstractEffect(eqx.Module):
     """A mechanism that the law does not contain. Every hook does nothing by default; override those it needs.
 
-    They act in this order, and each once for all effects of a law:
-
-    1. `modify`: parameters of the law for this particle (size, shape, humidity).
-    2. `loading`: factors on the three terms of the loading curve at a strain (rate, friction, hardening).
-    3. `stiffness`: factor on the effective modulus at a peak (damage, densification).
-    4. `inside`: displacement added inside the law (creep, pop-in, adhesion); additions of several effects add up.
-    5. `observe`: displacement added to what the instrument measures only (frame, drift, platens).
-
-    An effect with a memory of its own also gives `driver`, `start` and `evolve`; what `evolve` returns is
-    `context.memory` when `inside` is called.
+    They act in this order, and each once for all effects of a law: `modify` (size, shape, humidity), `loading` (rate,
+    friction, hardening), `stiffness` (damage, densification), `inside` (creep, pop-in, adhesion; several add up) and
+    `observe` (frame, drift, platens). An effect with a memory of its own also gives `driver`, `start` and `evolve`.
 
     Hooks are plain arithmetic on scalars or arrays over points, so that `vmap`, `jvp` and `grad` pass through. They
     must be finite with finite derivatives at zero force, on full release, at repeated points and at amplitude zero,
     where they must change nothing.
 
+    Where the hooks are the same for several formulas that differ in one expression, `formulas` holds the expressions,
+    functions of the effect and of what its hook gives them. A field that switches a part of a formula on is a number, 0
+    or 1: formulas that differ in it alone are compiled once where many are derived together (`mcc_jax.law.signatures`).
+
     Attributes:
         closed: whether all it does is a formula of particle and peak, without time, cycles or the room: `modify` of the
             particle alone, or the `AbstractModulusAtPeak`. Energy, particle codes and exports to other engines take
             those only. Set it on the class.
+        formulas: expressions by name. Set it on the class.
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
+        formula: the name of the expression of this effect.
         label: "mechanism:variant" where a `Variant` built it; by it results and messages name the effect.
     """
 
     closed: ClassVar[bool] = False
+    formulas: ClassVar[Mapping[str, Callable[..., Any]]] = {}
 
     amplitude: Scalar = eqx.field(converter=scalar)
+    formula: str = eqx.field(static=True, default="", kw_only=True)
     label: str = eqx.field(static=True, default="", kw_only=True)
 
     def __repr__(self) -> str:
-        names = [f.name for f in fields(self) if f.name not in ("label", "amplitude")]
-        numbers = [f"{name} {value_of(getattr(self, name))}" for name in names if hasattr(getattr(self, name), "shape")]
-        return ", ".join([f"{self.name} of amplitude {value_of(self.amplitude)}", *numbers])
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "amplitude"}
+        further = [f"{name} {value_of(value)}" for name, value in values.items() if hasattr(value, "shape")]
+        return ", ".join([f"{self.name} of amplitude {value_of(self.amplitude)}", *further])
 
     @property
     def name(self) -> str:
@@ -71,6 +71,10 @@ class AbstractEffect(eqx.Module):
     def overrides(cls, *hooks: str) -> bool:
         """Whether it has any of these hooks of its own."""
         return any(getattr(cls, hook) is not getattr(AbstractEffect, hook) for hook in hooks)
+
+    def of(self, *given: Any) -> Any:
+        """The expression of this effect's formula."""
+        return self.formulas[self.formula](self, *given)
 
     def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
         """The law with other parameters for this particle."""
@@ -102,7 +106,7 @@ class AbstractEffect(eqx.Module):
         return None
 
     def evolve(self, memory: Any, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Any, Any]:
-        """Memory after a step during which the driver went from `before` to `now`, and what `inside` gets to see."""
+        """Memory after a step during which the driver went from `before` to `now`, and `context.memory` of `inside`."""
         return memory, None
 
 
@@ -112,70 +116,28 @@ class AbstractModulusAtPeak(AbstractEffect):
     closed: ClassVar[bool] = True
 
     def factor(self, strain: Values, stress: Values) -> Values:
-        """The factor, > 0, at a peak strain [-] and a peak stress [MPa]."""
-        raise NotImplementedError
+        """The factor, > 0, at a peak strain [-] and a peak stress [MPa]: the formula, unless a class says otherwise."""
+        return self.of(strain, stress)
 
     def stiffness(self, context: Context) -> Values:
         """The factor at the peak so far."""
         return self.factor(context.peak_strain, context.peak_stress)
 
 
-Further = Any
-"""A further number that only some of a class's formulas have; None for the others."""
-
-
-def further() -> Any:
-    """A field of that kind."""
-    return eqx.field(converter=lambda x: None if x is None else scalar(x), default=None, kw_only=True)
-
-
-def switch(on: bool = False) -> Any:
-    """A field that turns a part of a formula on: a number, so that formulas that differ in it alone are compiled once
-    where many are derived together (`mcc_jax.law.signatures`)."""
-    return eqx.field(converter=_number, default=float(on), kw_only=True)
-
-
-def terms(first: bool = True, second: bool = False, third: bool = False) -> Any:
-    """A field of three switches, for instance of the linear, cubic and quintic term."""
-    default = float(first), float(second), float(third)
-    return eqx.field(converter=lambda given: tuple(map(_number, given)), default=default, kw_only=True)
-
-
-def _number(on: Any) -> Any:
-    return float(on) if isinstance(on, bool) else on
-
-
 def pick(on: Any, yes: Any, no: Any) -> Any:
-    """One of two values by a `switch`."""
+    """One of two values by a number, 0 or 1, that switches a part of a formula on."""
     if isinstance(on, float):
         return yes if on else no
     return jnp.where(on != 0, yes, no)
 
 
 def on_terms(chosen: tuple[Any, Any, Any], factor: Values) -> Factors:
-    """A factor on the chosen ones of three `terms`, 1 on the others."""
+    """A factor on those of three terms that are switched on, 1 on the others."""
     one = jnp.ones_like(factor)
     first, second, third = (pick(on, factor, one) for on in chosen)
     return first, second, third
 
 
-class AbstractFormulas(AbstractEffect):
-    """An effect whose hook is the same for several formulas that differ in one expression.
-
-    Attributes:
-        formulas: the expressions by name, functions of the effect and of what its hook gives them. Set it on the class.
-        formula: the name of this one's.
-    """
-
-    formulas: ClassVar[Mapping[str, Callable[..., Any]]] = {}
-
-    formula: str = eqx.field(static=True, kw_only=True)
-
-    def of(self, *given: Any) -> Any:
-        """The expression of this formula."""
-        return self.formulas[self.formula](self, *given)
-
-
-def at_least(x: Values, least: float | Values) -> Values:
+def at_least(x: Values, least: float | Values = MIN_FACTOR) -> Values:
     """`x`, but not below a floor: keeps a factor positive that an amplitude far from null would turn negative."""
     return jnp.where(x > least, x, least)

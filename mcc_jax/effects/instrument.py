@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
 from .._types import Scalar, Values
-from .context import Context, contact_radius
-from .effect import AbstractFormulas, Further, further, pick, switch
+from .effect import AbstractEffect, pick
+from .record import Context, contact_radius
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_FORCE_MN = 100.0
@@ -20,15 +20,11 @@ _PUNCH = f"{_SNEDDON}; Johnson (1985), Contact Mechanics, ch. 3"
 _OLIVER = "Oliver and Pharr (1992), J. Mater. Res. 7, 1564; Doerner and Nix (1986), J. Mater. Res. 1, 601"
 
 
-class _Observed(AbstractFormulas):
+class _Observed(AbstractEffect):
     """A formula of displacement that the read-out adds."""
 
     def observe(self, context: Context) -> Values:
-        """The formula."""
         return self.of(context)
-
-
-# ---- frame -----------------------------------------------------------------------------------------------------------
 
 
 def _power(amplitude: Scalar, x: Values, reference: float, power: float) -> Values:
@@ -39,7 +35,7 @@ def _power(amplitude: Scalar, x: Values, reference: float, power: float) -> Valu
 class FrameCompliance(_Observed):
     """Displacement of the frame under a force; the amplitude is its compliance, at 100 mN where it depends on force."""
 
-    seat_force_mN: Further = further()
+    seat_force_mN: Any = None
 
     formulas: ClassVar = {
         "linear": lambda e, c: e.amplitude * c.force,
@@ -53,8 +49,7 @@ class FrameCompliance(_Observed):
 _SEATS = (10.0, 22.0, 50.0, 110.0, 250.0)
 
 FRAME = family(
-    FrameCompliance,
-    "frame_compliance",
+    FrameCompliance, "frame_compliance",
     "The frame, load cell and glue of the instrument give way under force, and the read-out counts that as the "
     "particle's.",
     row("linear", "d = C F", "A linear spring in series with the particle.", source=_OLIVER),
@@ -64,20 +59,15 @@ FRAME = family(
     row("conical_seat", "d = C F (F / 100 mN)^(-1/2)", "A seat that bears on rough tips, d ~ F^(1/2).",
         source=_SNEDDON),
     row("stiffening", "d = C F_s ln(1 + F / F_s)", "Play that closes: the compliance falls as 1 / (1 + F / F_s).",
-        source="ad hoc (this work)",
-        nuisances=(Nuisance("seat_force_mN", _SEATS, (1.0, 2000.0), "force at which it has halved"),)),
+        Nuisance("seat_force_mN", _SEATS, (1.0, 2000.0), "force at which it has halved")),
     row("softening", "d = C F (F / 100 mN)^(1/2)",
-        "A frame that yields the more the harder it is pressed, d ~ F^(3/2): a loose guide that begins to slip.",
-        source="ad hoc (this work)"),
-    parameter="compliance_um_per_mN", unit="um/mN", plausible=(2e-4, 1e-2),
-    needs=(Need.UNLOADING,), helps=(Need.SEVERAL_SIZES, Need.SEVERAL_PEAKS),
+        "A frame that yields the more the harder it is pressed, d ~ F^(3/2): a loose guide that begins to slip."),
+    parameter="compliance_um_per_mN", unit="um/mN", plausible=(2e-4, 1e-2), needs=(Need.UNLOADING,),
+    helps=(Need.SEVERAL_SIZES, Need.SEVERAL_PEAKS),
     equivalences=("thermal_drift linear, while force grows at one rate",),
     check="press the punch on the bare platen, without a particle: what gives way there is the frame",
     coordinates=("force",),
 )  # fmt: skip
-
-
-# ---- drift -----------------------------------------------------------------------------------------------------------
 
 
 def _periodic(e: ThermalDrift, c: Context) -> Values:
@@ -89,9 +79,9 @@ def _periodic(e: ThermalDrift, c: Context) -> Values:
 class ThermalDrift(_Observed):
     """Displacement that grows with time; the amplitude is a speed: the first, the largest, or the mean over 100 s."""
 
-    tau_s: Further = further()
-    period_s: Further = further()
-    phase_rad: Further = further()
+    tau_s: Any = None
+    period_s: Any = None
+    phase_rad: Any = None
 
     formulas: ClassVar = {
         "linear": lambda e, c: e.amplitude * c.record.time,
@@ -105,21 +95,18 @@ class ThermalDrift(_Observed):
 _SETTLING = (10.0, 16.0, 25.0, 40.0, 63.0, 100.0, 160.0)
 
 DRIFT = family(
-    ThermalDrift,
-    "thermal_drift",
+    ThermalDrift, "thermal_drift",
     "The instrument warms up or cools down during the test: the read-out moves with time, whatever the force.",
     row("linear", "d = v t", "A constant speed, another one in every test."),
     row("settling", "d = v tau (1 - exp(-t / tau))", "A temperature that settles after the sample was placed.",
-        nuisances=(Nuisance("tau_s", _SETTLING, (2.0, 2000.0), "time in which it settles"),)),
+        Nuisance("tau_s", _SETTLING, (2.0, 2000.0), "time in which it settles")),
     row("sqrt_time", "d = v t (t / 100 s)^(-1/2)", "Heat that diffuses into a thick body."),
     row("accelerating", "d = v t (t / 100 s)", "A room that warms up faster and faster.", plausible=(2e-5, 2e-3)),
     row("periodic", "d = v P / (2 pi) [sin(2 pi t / P + phase) - sin(phase)]",
         "Air conditioning that switches on and off.",
-        nuisances=(
-            Nuisance("period_s", (120.0, 400.0), (20.0, 3600.0), "time between two switchings"),
-            Nuisance("phase_rad", (0.0, 1.5707963267948966), (-3.15, 3.15), "where in its swing the test began",
-                     random_per_test=True),
-        )),
+        Nuisance("period_s", (120.0, 400.0), (20.0, 3600.0), "time between two switchings"),
+        Nuisance("phase_rad", (0.0, 1.5707963267948966), (-3.15, 3.15), "where in its swing the test began",
+                 random_per_test=True)),
     parameter="drift_um_per_s", unit="um/s", sign=0, plausible=(1e-4, 1e-2), random_per_test=True,
     source="Oliver and Pharr (1992); Feng and Ngan (2002), J. Mater. Res. 17, 660", needs=(Need.UNLOADING,),
     helps=(Need.HOLD, Need.LONG_TIME, Need.TWO_RATES),
@@ -127,9 +114,6 @@ DRIFT = family(
     check="hold for a minute close to zero load before and after each test: what moves there is drift",
     coordinates=("time",),
 )  # fmt: skip
-
-
-# ---- platens ---------------------------------------------------------------------------------------------------------
 
 
 def _floored(context: Context, radius: Values) -> Values:
@@ -164,8 +148,8 @@ class PlatenSinkIn(_Observed):
     peak, or with `shrinks` that of now.
     """
 
-    shrinks: float = switch()
-    punch_radius_um: Further = further()
+    shrinks: float = 0.0
+    punch_radius_um: Any = None
 
     formulas: ClassVar = {
         "flat": _flat,
@@ -176,21 +160,17 @@ class PlatenSinkIn(_Observed):
 
 
 SINK_IN = family(
-    PlatenSinkIn,
-    "platen_sink_in",
-    "The platens are no rigid planes: the contact sinks into them.",
+    PlatenSinkIn, "platen_sink_in", "The platens are no rigid planes: the contact sinks into them.",
     row("flat", "d = F / (2 a_P E*)", "The contact presses like a punch of its widest radius."),
-    row("current_contact", "d = F / (2 a E*)", "The same with the radius left on unloading.",
-        formula="flat", shrinks=True),
+    row("current_contact", "d = F / (2 a E*)", "The same with the radius left on unloading.", formula="flat",
+        shrinks=1.0),
     row("yield_pressure", "d = F / (2 a E*), a = D_e sqrt(c^2 sigma / (C1 eta))",
         "The radius follows the force at the pressure of first yield."),
     row("layer", "d = F h / (pi a_P^2 E), h = 10 um", "A thin soft layer, dust or glue.",
         source="Johnson (1985), sec. 5.8", plausible=(0.3, 30.0)),
     row("finite_punch", "d = F / (2 min(a_P, R_punch) E*)", "The contact grows until it is as wide as the punch.",
-        nuisances=(Nuisance("punch_radius_um", (50.0, 100.0), (20.0, 500.0), "radius of the flat punch"),)),
+        Nuisance("punch_radius_um", (50.0, 100.0), (20.0, 500.0), "radius of the flat punch")),
     parameter="inverse_modulus_per_GPa", unit="1/GPa", plausible=(0.01, 1.0), source=_PUNCH, needs=(Need.UNLOADING,),
-    helps=(Need.SEVERAL_SIZES, Need.HOLD),
-    equivalences=("the width of the punch, as long as no contact is wider",),
-    check="repeat on a platen of diamond or sapphire",
-    coordinates=("peak", "load", "size"),
+    helps=(Need.SEVERAL_SIZES, Need.HOLD), equivalences=("the width of the punch, as long as no contact is wider",),
+    check="repeat on a platen of diamond or sapphire", coordinates=("peak", "load", "size"),
 )  # fmt: skip

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from .._errors import InputError
-from . import contact, creep, cycles, instrument, loading, material, unloading
+from . import contact, history, instrument, loading, material, unloading
 from .variant import Mechanism, Variant
-
-_ALL = (
-    instrument.FRAME, instrument.DRIFT, creep.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE,
-    material.DENSIFICATION, cycles.HYSTERESIS, cycles.RATCHETING, loading.HARDENING, unloading.SHAPE_OF_UNLOADING,
-    material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION, contact.MISALIGNMENT,
-    instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
-)  # fmt: skip
 
 
 class _Library(Mapping[str, Mechanism]):
     """Mechanisms by name, which nobody can change."""
 
-    def __init__(self, mechanisms: Iterable[Mechanism]) -> None:
+    def __init__(self, *mechanisms: Mechanism) -> None:
         self._by_name = {mechanism.name: mechanism for mechanism in mechanisms}
 
     def __getitem__(self, name: str) -> Mechanism:
@@ -37,7 +30,12 @@ class _Library(Mapping[str, Mechanism]):
         return f"{len(self)} mechanisms, {formulas} formulas:\n" + textwrap.fill(", ".join(self), 100)
 
 
-LIBRARY: Mapping[str, Mechanism] = _Library(_ALL)
+LIBRARY: Mapping[str, Mechanism] = _Library(
+    instrument.FRAME, instrument.DRIFT, history.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE,
+    material.DENSIFICATION, history.HYSTERESIS, history.RATCHETING, loading.HARDENING, unloading.SHAPE_OF_UNLOADING,
+    material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION, contact.MISALIGNMENT,
+    instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
+)  # fmt: skip
 """The mechanisms known by name, in a fixed order."""
 
 
@@ -55,10 +53,4 @@ def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Varia
     mechanism, _, variant = name.partition(":")
     if mechanism not in library:
         raise InputError(f"there is no mechanism {mechanism!r}", remedy=f"Known: {', '.join(library)}.")
-    known = library[mechanism]
-    if not variant:
-        return known.variants[0]
-    try:
-        return known[variant]
-    except KeyError as error:
-        raise InputError(error.args[0]) from None
+    return library[mechanism][variant] if variant else library[mechanism].variants[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from .._types import Values
 from ..formulas import PUNCH_AREA, Formulas, recovery, tangent_modulus
 from ..geometry import Particle
-from .context import Context, root
-from .effect import MIN_FACTOR, AbstractFormulas, Factors, Further, at_least, further, on_terms, terms
-from .record import Record
+from .effect import AbstractEffect, Factors, at_least, on_terms
+from .record import Context, Record, contact_radius, root
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_FORCE_RATE = 2.0  # mN/s
@@ -21,43 +20,17 @@ REFERENCE_STRAIN_RATE = 2e-3  # 1/s
 REFERENCE_STRAIN = 0.2
 
 
-# ---- rate ------------------------------------------------------------------------------------------------------------
-
-
-def _force_rate(law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
-    """F' / (2 mN/s)."""
-    return record.loading_rate / REFERENCE_FORCE_RATE + jnp.zeros_like(strain)
-
-
-def _stress_rate(law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
-    """sigma' / (0.05 MPa/s)."""
-    return particle.stress(record.loading_rate) / REFERENCE_STRESS_RATE + jnp.zeros_like(strain)
-
-
-def _strain_rate(law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
-    """eps' / (2e-3 1/s), eps' = sigma' / (d sigma / d eps) with the base law's tangent at that strain."""
-    K1, K3, K5 = law.plastic.polynomial
-    eta = law.shape_factor(particle)
-    slope = tangent_modulus(K1, K3, K5, eta * strain)
-    slope = eta * at_least(slope, 0.1 * K1)
-    return particle.stress(record.loading_rate) / slope / REFERENCE_STRAIN_RATE
-
-
-_RATES = {"force": _force_rate, "stress": _stress_rate, "strain": _strain_rate}
-
-
-class RateDependence(AbstractFormulas):
+class RateDependence(AbstractEffect):
     """Flow stress that grows with a rate, relative to a reference rate; a rate that is not known changes nothing.
 
-    Attributes:
-        rate_of: force, stress or strain, of which the rate counts.
-        terms: linear, cubic and quintic term of loading: those that grow.
+    It is the rate of force, stress or strain (`rate_of`) in the latest loading ramp, of strain by the tangent there.
+    With `terms` only some of the linear, cubic and quintic term of loading grow.
     """
 
     rate_of: str = eqx.field(static=True, default="strain", kw_only=True)
-    terms: tuple[float, float, float] = terms(True, True, True)
-    exponent: Further = further()
-    rate_share: Further = further()
+    terms: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    exponent: Any = None
+    rate_share: Any = None
 
     formulas: ClassVar = {
         "logarithm": lambda e, rate: 1 + e.amplitude * jnp.log(rate),
@@ -66,84 +39,80 @@ class RateDependence(AbstractFormulas):
         "eyring": lambda e, rate: 1 + e.amplitude * jnp.arcsinh(rate / e.rate_share),
     }
 
+    def rate(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
+        if self.rate_of == "force":
+            return record.loading_rate / REFERENCE_FORCE_RATE + jnp.zeros_like(strain)
+        stress_rate = particle.stress(record.loading_rate)
+        if self.rate_of == "stress":
+            return stress_rate / REFERENCE_STRESS_RATE + jnp.zeros_like(strain)
+        K1, K3, K5 = law.plastic.polynomial
+        eta = law.shape_factor(particle)
+        slope = tangent_modulus(K1, K3, K5, eta * strain)
+        return stress_rate / (eta * at_least(slope, 0.1 * K1)) / REFERENCE_STRAIN_RATE
+
     def factor(self, rate: Values) -> Values:
-        """The formula at a rate over the reference, 1 where it is not known."""
         known = rate > 0
-        return jnp.where(known, at_least(self.of(jnp.where(known, rate, 1.0)), MIN_FACTOR), 1.0)
+        return jnp.where(known, at_least(self.of(jnp.where(known, rate, 1.0))), 1.0)
 
     def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
-        """The factor at the rate of the latest loading ramp, on the chosen terms."""
-        return on_terms(self.terms, self.factor(_RATES[self.rate_of](law, particle, record, strain)))
+        return on_terms(self.terms, self.factor(self.rate(law, particle, record, strain)))
 
 
 class RateOfFlowAndModulus(RateDependence):
     """Flow stress and modulus grow together with the rate of force."""
 
     def stiffness(self, context: Context) -> Values:
-        """The factor at the rate of the latest ramp."""
         return self.factor(context.record.rate / REFERENCE_FORCE_RATE) + jnp.zeros_like(context.peak_strain)
 
 
 _RATE = "Roberts and Rowe (1985), Chem. Eng. Sci. 40, 4; Schmalbach et al. (2021), J. Mater. Res."
 _EYRING = "Eyring (1936), J. Chem. Phys. 4, 283; Ree and Eyring (1955), J. Appl. Phys. 26, 793"
-_ACTIVATED = (Nuisance("rate_share", (0.1, 1.0, 10.0), (0.01, 100.0), "strain rate of the crossover over 0.002/s"),)
-_ALONG = ()  # a strain rate varies along one test and from size to size, so that one force rate shows it, if weakly
-_YIELD, _HARDENING = (True, False, False), (False, False, True)
+_ACTIVATED = Nuisance("rate_share", (0.1, 1.0, 10.0), (0.01, 100.0), "strain rate of the crossover over 0.002/s")
+_TWO_RATES = (Need.TWO_RATES,)  # the other rates vary along one test and from size to size: one force rate shows them
+_YIELD, _HARDENING = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
 RATE = family(
-    RateDependence,
-    "rate_dependence",
-    "The faster the particle is loaded, the harder it is to deform plastically.",
+    RateDependence, "rate_dependence", "The faster the particle is loaded, the harder it is to deform plastically.",
     row("yield_log_strain_rate", "C1 (1 + m ln(eps' / 0.002/s))",
-        "Only the yield term C1 grows, with the logarithm of the strain rate.", needs=_ALONG,
-        formula="logarithm", terms=_YIELD),
+        "Only the yield term C1 grows, with the logarithm of the strain rate.", terms=_YIELD),
     row("flow_log_strain_rate", "sigma(eps) (1 + m ln(eps' / 0.002/s))",
-        "Flow stress grows with the logarithm of the strain rate.", source="Johnson and Cook (1985)", needs=_ALONG,
-        formula="logarithm"),
+        "Flow stress grows with the logarithm of the strain rate.", source="Johnson and Cook (1985)"),
     row("flow_log_force_rate", "sigma(eps) (1 + m ln(F' / 2 mN/s))",
-        "Flow stress grows with the logarithm of the loading rate.", formula="logarithm", rate_of="force"),
+        "Flow stress grows with the logarithm of the loading rate.", rate_of="force", needs=_TWO_RATES),
     row("flow_power_strain_rate", "sigma(eps) (eps' / 0.002/s)^m", "Flow stress as a power of the strain rate.",
-        source="Biwa and Storakers (1995), J. Mech. Phys. Solids 43, 1303", needs=_ALONG, formula="power"),
+        source="Biwa and Storakers (1995), J. Mech. Phys. Solids 43, 1303", formula="power"),
     row("flow_power_stress_rate", "sigma(eps) (sigma' / 0.05 MPa/s)^m", "Flow stress as a power of the stress rate.",
-        needs=_ALONG, formula="power", rate_of="stress"),
+        formula="power", rate_of="stress"),
     row("cowper_symonds", "sigma(eps) (1 + m (eps' / 0.002/s)^q)", "Overstress as a power of the strain rate.",
-        source="Cowper and Symonds (1957)", needs=_ALONG,
-        nuisances=(Nuisance("exponent", (0.2, 0.5), (0.05, 1.0), "power of the strain rate"),)),
+        Nuisance("exponent", (0.2, 0.5), (0.05, 1.0), "power of the strain rate"), source="Cowper and Symonds (1957)",
+        formula="cowper_symonds"),
     row("hardening_log_strain_rate", "C5^5 (1 + m ln(eps' / 0.002/s))",
-        "Only the hardening term grows with the strain rate.", needs=_ALONG, formula="logarithm", terms=_HARDENING),
-    row("flow_and_modulus_log_force_rate",
-        "sigma(eps) and E (1 + m ln(F' / 2 mN/s)), each at the rate of its own ramp",
-        "Flow stress and unloading stiffness grow together.", make=RateOfFlowAndModulus,
-        formula="logarithm", rate_of="force"),
+        "Only the hardening term grows with the strain rate.", terms=_HARDENING),
+    row("flow_and_modulus_log_force_rate", "sigma(eps) and E (1 + m ln(F' / 2 mN/s)), each at the rate of its own ramp",
+        "Flow stress and unloading stiffness grow together.", make=RateOfFlowAndModulus, rate_of="force",
+        needs=_TWO_RATES),
     row("flow_eyring", "sigma(eps) [1 + m asinh(eps' / (r 0.002/s))]",
-        "Thermally activated flow: viscous at low rates, logarithmic at high ones.", source=_EYRING, needs=_ALONG,
-        nuisances=_ACTIVATED, formula="eyring"),
-    row("yield_eyring", "C1 [1 + m asinh(eps' / (r 0.002/s))]", "The same of the yield term C1 only.", source=_EYRING,
-        needs=_ALONG, nuisances=_ACTIVATED, formula="eyring", terms=_YIELD),
-    parameter="rate_sensitivity", plausible=(0.003, 0.1), source=_RATE, needs=(Need.TWO_RATES,),
-    helps=(Need.SEVERAL_SIZES,),
-    equivalences=("size_effect, at one force rate",),
-    check="load at two rates or more within one class of sizes",
-    coordinates=("peak", "rate"),
+        "Thermally activated flow: viscous at low rates, logarithmic at high ones.", _ACTIVATED, source=_EYRING,
+        formula="eyring"),
+    row("yield_eyring", "C1 [1 + m asinh(eps' / (r 0.002/s))]", "The same of the yield term C1 only.", _ACTIVATED,
+        source=_EYRING, formula="eyring", terms=_YIELD),
+    formula="logarithm", parameter="rate_sensitivity", plausible=(0.003, 0.1), source=_RATE,
+    helps=(Need.SEVERAL_SIZES,), equivalences=("size_effect, at one force rate",),
+    check="load at two rates or more within one class of sizes", coordinates=("peak", "rate"),
 )  # fmt: skip
 
 
-# ---- friction --------------------------------------------------------------------------------------------------------
-
-
-class LoadingFactor(AbstractFormulas):
+class LoadingFactor(AbstractEffect):
     """One factor on the whole loading stress; a formula is the factor of a particle at a strain."""
 
     def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
-        """The factor on all three terms."""
-        factor = at_least(self.of(particle, strain), MIN_FACTOR)
+        factor = at_least(self.of(particle, strain))
         return factor, factor, factor
 
 
 def _slenderness(particle: Particle, strain: Values) -> Values:
     """Contact radius over the height left between the platens, which does not fall below a tenth of D3."""
-    radius = particle.effective_diameter * root(PUNCH_AREA * strain)
-    return radius / at_least(particle.D3 - particle.displacement(strain), 0.1 * particle.D3)
+    return contact_radius(particle, strain) / at_least(particle.D3 - particle.displacement(strain), 0.1 * particle.D3)
 
 
 def _slab(e: PlatenFriction, particle: Particle, strain: Values) -> Values:
@@ -167,8 +136,7 @@ class PlatenFriction(LoadingFactor):
 
 
 FRICTION = family(
-    PlatenFriction,
-    "platen_friction",
+    PlatenFriction, "platen_friction",
     "The platens hold the spreading contact back, so that the particle carries more the flatter it gets.",
     row("siebel", "sigma(eps) [1 + (2 mu / 3) a / h]",
         "Mean pressure of the friction hill on a disc of radius a and height h.", source="Siebel (1923)"),
@@ -181,26 +149,22 @@ FRICTION = family(
         "The contact sticks; the constraint grows with the square of its slenderness.",
         source="Brizmer, Kligerman and Etsion (2006), Int. J. Solids Struct. 43, 5736; Zait et al. (2010)",
         plausible=(0.1 / 40, 0.1)),
-    row("strain", "sigma(eps) (1 + mu eps)", "A constraint that grows with strain alone.", source="ad hoc (this work)"),
+    row("strain", "sigma(eps) (1 + mu eps)", "A constraint that grows with strain alone."),
     parameter="friction_coefficient", plausible=(0.4 / 40, 0.4), helps=(Need.SEVERAL_SHAPES, Need.SEVERAL_PEAKS),
-    check="repeat with lubricated and with roughened platens",
-    coordinates=("peak", "shape"),
+    check="repeat with lubricated and with roughened platens", coordinates=("peak", "shape"),
 )  # fmt: skip
 
 
-# ---- hardening exponent ----------------------------------------------------------------------------------------------
-
-
-class Hardening(AbstractFormulas):
+class Hardening(AbstractEffect):
     """Hardening as a power of strain in place of flow at one stress; the amplitude is 1/m, 1 for Hertz.
 
     A formula is a logarithm, and the factor on the chosen terms its exponential to the power 1/2m. With `every_term`
     the terms of order j = 1, 3, 5 have the j-th power of that, as where a power of strain takes the place of strain.
     """
 
-    terms: tuple[float, float, float] = terms(True, True, True)
+    terms: tuple[float, float, float] = (1.0, 1.0, 1.0)
     every_term: bool = eqx.field(static=True, default=False, kw_only=True)
-    yield_strain: Further = further()
+    yield_strain: Any = None
 
     formulas: ClassVar = {
         "power": lambda e, eps: jnp.log(jnp.where(eps > 1e-9, eps, 1e-9) / REFERENCE_STRAIN),
@@ -208,7 +172,6 @@ class Hardening(AbstractFormulas):
     }
 
     def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
-        """(eps / 0.2)^(1/2m), or with a yield strain."""
         factor = jnp.exp(0.5 * self.amplitude * self.of(strain))
         return (factor, factor**3, factor**5) if self.every_term else on_terms(self.terms, factor)
 
@@ -217,7 +180,6 @@ class HardeningAndLoad(Hardening):
     """The same exponent on the pressure that unloading releases."""
 
     def inside(self, context: Context) -> Values:
-        """Delta [s(u) - s(u^(1 / (1 + 1/2m)))]."""
         half_inverse, share = 0.5 * self.amplitude, context.load_share
         some = share > 0
         log = jnp.log(jnp.where(some, share, 1.0))
@@ -229,7 +191,6 @@ class HardeningAndContact(Hardening):
     """The same exponent on the recovered share: to first order, an exponent 2 (1 + 1/2m) in place of 2 on unloading."""
 
     def inside(self, context: Context) -> Values:
-        """Delta [s - s^(1 / (1 + 1/2m))]."""
         share = context.recovered_share
         some = share > 0
         power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / (1 + 0.5 * self.amplitude))
@@ -240,8 +201,7 @@ _STORAKERS = "Biwa and Storakers (1995); Storakers, Biwa and Larsson (1997), Int
 _OLSSON = "Olsson and Larsson (2013)"
 
 HARDENING = family(
-    Hardening,
-    "finite_hardening_exponent",
+    Hardening, "finite_hardening_exponent",
     "The material hardens as a power of strain instead of flowing at one stress: the curve bends the other way at low "
     "load.",
     row("linear_term", "C1 eta eps (eps / 0.2)^(1/2m)",
@@ -254,8 +214,9 @@ HARDENING = family(
         "The similarity solution in place of the linear term, and to first order on unloading.",
         make=HardeningAndContact, terms=_YIELD),
     row("ludwik", "sigma(eps) [(1 + eps / eps_y) / (1 + 0.2 / eps_y)]^(1/2m)",
-        "Hardening that begins at a yield strain.", source="Ludwik (1909); Swift (1952)", formula="ludwik",
-        nuisances=(Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),)),
+        "Hardening that begins at a yield strain.",
+        Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),
+        source="Ludwik (1909); Swift (1952)", formula="ludwik"),
     row("every_term", "sigma(0.2 (eps / 0.2)^(1 + 1/2m))",
         "A power of strain in place of strain in every term; 1/m = 1 is an elastic contact after Hertz, "
         "ceramic pebbles show 1.2 to 1.6.", plausible=(0.02, 2.0), every_term=True),
@@ -263,6 +224,5 @@ HARDENING = family(
         "The same, and on the pressure that unloading releases.", source=_OLSSON, plausible=(0.02, 2.0),
         make=HardeningAndLoad, every_term=True),
     formula="power", parameter="inverse_exponent", plausible=(0.01, 0.5), source=_STORAKERS, helps=(Need.LOW_LOAD,),
-    check="repeat between polished platens, or indent a compact of the same powder",
-    coordinates=("peak", "load"),
+    check="repeat between polished platens, or indent a compact of the same powder", coordinates=("peak", "load"),
 )  # fmt: skip

@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values
 from ..formulas import Formulas, Plastic
 from ..geometry import Particle
-from .context import Context, positive
-from .effect import (
-    MIN_FACTOR,
-    AbstractEffect,
-    AbstractFormulas,
-    AbstractModulusAtPeak,
-    Further,
-    at_least,
-    further,
-    on_terms,
-    pick,
-    switch,
-    terms,
-)
+from .effect import AbstractEffect, AbstractModulusAtPeak, at_least, on_terms, pick
 from .loading import LoadingFactor
-from .record import REFERENCE_HUMIDITY_PERCENT, Record
+from .record import REFERENCE_HUMIDITY_PERCENT, Context, Record, positive
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_DIAMETER_UM = 200.0
@@ -40,20 +26,16 @@ def scaled(law: Formulas, first: Scalar, others: Scalar, modulus: Scalar) -> For
     return Formulas(plastic, law.a, law.effective_modulus * modulus, law.unloading, law.strain_scaling)
 
 
-class Strength(AbstractFormulas):
+class Strength(AbstractEffect):
     """One factor for the particle and its test, the formula, on the chosen parameters: C1; C3 and C5; the modulus."""
 
-    terms: tuple[float, float, float] = terms()
+    terms: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
     def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
-        """The law with the factor on the chosen parameters."""
-        return scaled(law, *on_terms(self.terms, at_least(self.of(particle, record), MIN_FACTOR)))
+        return scaled(law, *on_terms(self.terms, at_least(self.of(particle, record))))
 
 
-_FLOW, _MODULUS, _WHOLE = (True, True, False), (False, False, True), (True, True, True)
-
-
-# ---- size ------------------------------------------------------------------------------------------------------------
+_FLOW, _MODULUS, _WHOLE = (1.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0)
 
 
 def _size_power(e: SizeEffect, particle: Particle, _: Record) -> Scalar:
@@ -62,15 +44,15 @@ def _size_power(e: SizeEffect, particle: Particle, _: Record) -> Scalar:
 
 
 def _gradient(e: SizeEffect, particle: Particle, _: Record) -> Scalar:
-    grown = at_least(1 + 2 * e.amplitude * REFERENCE_DIAMETER_UM / particle.effective_diameter, MIN_FACTOR)
-    return jnp.sqrt(grown / at_least(1 + 2 * e.amplitude, MIN_FACTOR))
+    grown = at_least(1 + 2 * e.amplitude * REFERENCE_DIAMETER_UM / particle.effective_diameter)
+    return jnp.sqrt(grown / at_least(1 + 2 * e.amplitude))
 
 
 class SizeEffect(Strength):
     """Strength that depends on size, D_e or with `mean_size` the mean diameter."""
 
     closed: ClassVar[bool] = True
-    mean_size: float = switch()
+    mean_size: float = 0.0
 
     formulas: ClassVar = {
         "power": _size_power,
@@ -80,17 +62,15 @@ class SizeEffect(Strength):
 
 
 SIZE = family(
-    SizeEffect,
-    "size_effect",
+    SizeEffect, "size_effect",
     "Small particles are stronger than large ones of the same material (or weaker, if they are more porous).",
     row("C1", "C1 (D_e / 200 um)^-n", "The yield term depends on size."),
     row("flow", "sigma(eps) (D_e / 200 um)^-n", "The whole loading curve depends on size.", terms=_FLOW),
-    row("C1_and_modulus", "C1 and E (D_e / 200 um)^-n", "Yield and stiffness depend on size.",
-        terms=(True, False, True)),
+    row("C1_and_modulus", "C1 and E (D_e / 200 um)^-n", "Yield and stiffness depend on size.", terms=(1.0, 0.0, 1.0)),
     row("flow_and_modulus", "sigma(eps) and E (D_e / 200 um)^-n",
         "Everything depends on size, as with porosity that differs from sieve cut to sieve cut.", terms=_WHOLE),
     row("flow_mean_diameter", "sigma(eps) (mean diameter / 200 um)^-n",
-        "Size is the mean of the three diameters, not D1 D2 / D3.", terms=_FLOW, mean_size=True),
+        "Size is the mean of the three diameters, not D1 D2 / D3.", terms=_FLOW, mean_size=1.0),
     row("flow_logarithm", "sigma(eps) [1 - n ln(D_e / 200 um)]", "Logarithmic in size.", source="ad hoc (this work)",
         formula="logarithm", terms=_FLOW),
     row("strain_gradient", "sigma(eps) sqrt[(1 + 2n 200 um / D_e) / (1 + 2n)]",
@@ -103,10 +83,7 @@ SIZE = family(
 )  # fmt: skip
 
 
-# ---- shape -----------------------------------------------------------------------------------------------------------
-
-
-class SecondOrderShape(AbstractFormulas):
+class SecondOrderShape(AbstractEffect):
     r"""A second-order shape factor: a formula is what multiplies :math:`\eta_p`.
 
     Written as factors on coefficients, :math:`C_j \to C_j g`, and on the modulus, :math:`\bar E \to \bar E g^p` (half
@@ -125,16 +102,14 @@ class SecondOrderShape(AbstractFormulas):
     }
 
     def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
-        """Coefficients and modulus with the factor."""
-        g = at_least(self.of(particle), MIN_FACTOR)
+        g = at_least(self.of(particle))
         power = law.strain_scaling.power / law.unloading.stress_power
         plastic = Plastic(law.plastic.C1 * g, law.plastic.C3 * g, law.plastic.C5 * g)
         return Formulas(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
 
 
 SHAPE = family(
-    SecondOrderShape,
-    "shape_second_order",
+    SecondOrderShape, "shape_second_order",
     "The shape factor is not linear in flatness, or the outline in the plane of the platens matters, too.",
     row("flatness_squared", "eta_p (1 + b q^2), q = 1 - D3^2/(D1 D2)", "The next term in flatness."),
     row("flatness_exponential", "eta_p exp(b q^2)", "The same, never negative."),
@@ -145,12 +120,8 @@ SHAPE = family(
     parameter="shape_coefficient", sign=0, plausible=(0.05, 2.0), needs=(Need.SEVERAL_SHAPES,),
     source="Bommireddy et al. (2018), eq. 13, taken to the next order; Zheng et al. (2013)",
     equivalences=("shape parameter a and mean coefficients, if all particles have one shape",),
-    check="test elongated particles both lying and standing",
-    coordinates=("shape", "outline"),
+    check="test elongated particles both lying and standing", coordinates=("shape", "outline"),
 )  # fmt: skip
-
-
-# ---- humidity --------------------------------------------------------------------------------------------------------
 
 
 def _dampness(record: Record) -> Scalar:
@@ -158,15 +129,10 @@ def _dampness(record: Record) -> Scalar:
 
 
 class Humidity(Strength):
-    """Water softens the particle.
+    """Water softens the particle; with a `modulus_share` the modulus at so many times the rate of C1."""
 
-    Attributes:
-        modulus_share: rate at which the modulus softens over that of C1, for both at once.
-        threshold_percent: relative humidity where softening begins.
-    """
-
-    modulus_share: Further = further()
-    threshold_percent: Further = further()
+    modulus_share: Any = None
+    threshold_percent: Any = None
 
     formulas: ClassVar = {
         "exponential": lambda e, _, r: jnp.exp(-e.amplitude * _dampness(r)),
@@ -175,104 +141,87 @@ class Humidity(Strength):
     }
 
     def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
-        """The law with the factor, or C1 with it and the modulus with its power."""
         if self.modulus_share is None:
             return super().modify(law, particle, record)
-        first = at_least(self.of(particle, record), MIN_FACTOR)
+        first = at_least(self.of(particle, record))
         return scaled(law, first, jnp.ones_like(first), first**self.modulus_share)
 
 
 HUMIDITY = family(
-    Humidity,
-    "humidity",
-    "Water in the particle softens it: in humid air it deforms under less stress.",
+    Humidity, "humidity", "Water in the particle softens it: in humid air it deforms under less stress.",
     row("C1_and_modulus", "C1 exp(-k (RH - 45)) and E exp(-r k (RH - 45))",
         "The yield term softens, and the modulus with it.",
-        nuisances=(Nuisance("modulus_share", (0.5, 1.0), (0.0, 3.0), "rate of E over that of C1"),)),
+        Nuisance("modulus_share", (0.5, 1.0), (0.0, 3.0), "rate of E over that of C1")),
     row("C1", "C1 exp(-k (RH - 45))", "The yield term softens."),
     row("flow", "sigma(eps) exp(-k (RH - 45))", "The whole loading curve softens.", terms=_FLOW),
     row("modulus", "E exp(-k (RH - 45))", "Only the elastic modulus softens.", terms=_MODULUS),
     row("flow_and_modulus", "sigma(eps) and E exp(-k (RH - 45))", "Everything softens.", terms=_WHOLE),
     row("flow_linear", "sigma(eps) [1 - k (RH - 45)]", "Softening in proportion.", formula="linear", terms=_FLOW),
     row("flow_threshold", "sigma(eps) exp(-k (RH - RH_0)) above RH_0",
-        "Nothing happens until about 5 % of water is taken up.", formula="threshold", terms=_FLOW,
-        nuisances=(Nuisance("threshold_percent", (40.0, 60.0), (5.0, 90.0), "humidity where it begins"),)),
+        "Nothing happens until about 5 % of water is taken up.",
+        Nuisance("threshold_percent", (40.0, 60.0), (5.0, 90.0), "humidity where it begins"), formula="threshold",
+        terms=_FLOW),
     formula="exponential", parameter="softening_per_percent_humidity", unit="1/%", plausible=(5e-4, 2e-2),
     source="Amidon and Houghton (1995), Pharm. Res. 12, 923", needs=(Need.HUMIDITY_COLUMN,),
-    check="test in a chamber at 10, 40 and 75 % relative humidity",
-    coordinates=("humidity", "peak"),
+    check="test in a chamber at 10, 40 and 75 % relative humidity", coordinates=("humidity", "peak"),
 )  # fmt: skip
 
 
-# ---- modulus against peak --------------------------------------------------------------------------------------------
+class Damage(AbstractModulusAtPeak):
+    """Modulus that changes with the largest strain eps_P or the stress there; a formula is its factor."""
 
+    direction: ClassVar[float] = -1.0
 
-class ModulusAtPeak(AbstractFormulas, AbstractModulusAtPeak):
-    """Modulus that changes with the largest strain eps_P or the stress there; a formula is its factor.
-
-    Attributes:
-        direction: -1 for damage, +1 for densification.
-        threshold_strain: strain where damage begins.
-        heckel_stress_MPa: stress that closes most pores; the amplitude multiplies the porosity lost.
-    """
-
-    direction: float = eqx.field(static=True, default=-1.0, kw_only=True)
-    threshold_strain: Further = further()
-    heckel_stress_MPa: Further = further()
+    threshold_strain: Any = None
+    heckel_stress_MPa: Any = None
 
     formulas: ClassVar = {
         "exponential": lambda e, eps, _: jnp.exp(e.signed * eps),
-        "linear": lambda e, eps, _: at_least(1 + e.signed * eps, MIN_FACTOR),
-        "rational": lambda e, eps, _: 1 / at_least(1 - e.signed * eps, MIN_FACTOR),
-        "cellular": lambda e, eps, _: at_least(1 + e.signed * eps / 2, MIN_FACTOR) ** 2,
+        "linear": lambda e, eps, _: at_least(1 + e.signed * eps),
+        "rational": lambda e, eps, _: 1 / at_least(1 - e.signed * eps),
+        "cellular": lambda e, eps, _: at_least(1 + e.signed * eps / 2) ** 2,
         "square": lambda e, eps, _: jnp.exp(e.signed * (2 * eps * eps)),
         "stress": lambda e, _, sigma: jnp.exp(e.signed * (sigma / REFERENCE_STRESS_MPA)),
         "threshold": lambda e, eps, _: jnp.exp(-e.amplitude * positive(eps - e.threshold_strain)),
-        "relative_density": lambda e, eps, _: jnp.exp(-e.amplitude * jnp.log(at_least(1 - eps / 2, MIN_FACTOR))),
+        "relative_density": lambda e, eps, _: jnp.exp(-e.amplitude * jnp.log(at_least(1 - eps / 2))),
         "heckel": lambda e, _, sigma: jnp.exp(-e.amplitude * jnp.expm1(-sigma / e.heckel_stress_MPa)),
     }
 
     @property
     def signed(self) -> Scalar:
-        """The amplitude, above zero where the modulus grows."""
         return self.direction * self.amplitude
 
-    def factor(self, strain: Values, stress: Values) -> Values:
-        """The formula."""
-        return self.of(strain, stress)
+
+class Densification(Damage):
+    """The same where the modulus grows; of "heckel" the amplitude multiplies the porosity lost."""
+
+    direction: ClassVar[float] = 1.0
 
 
 class CyclicDamage(AbstractEffect):
     """Damage by every reload."""
 
     def stiffness(self, context: Context) -> Values:
-        """1 / (1 + kappa N)."""
-        return 1 / at_least(1 + self.amplitude * context.cycles, MIN_FACTOR)
+        return 1 / at_least(1 + self.amplitude * context.cycles)
 
 
 DAMAGE = family(
-    ModulusAtPeak,
-    "damage",
-    "Bonds break while the particle is squeezed: the further it went, the softer it unloads.",
+    Damage, "damage", "Bonds break while the particle is squeezed: the further it went, the softer it unloads.",
     row("exponential", "E exp(-kappa eps_P)", "A share of the bonds breaks per unit of strain."),
     row("linear", "E (1 - kappa eps_P)", "Damage in proportion to strain."),
     row("rational", "E / (1 + kappa eps_P)", "The compliance of cracks is added."),
     row("square", "E exp(-2 kappa eps_P^2)", "Damage that sets in late."),
     row("stress", "E exp(-kappa sigma_P / 10 MPa)", "Damage driven by stress."),
     row("threshold", "E exp(-kappa (eps_P - eps_0)) above eps_0", "No damage until a strain is reached.",
-        nuisances=(Nuisance("threshold_strain", (0.15, 0.3), (0.0, 0.6), "strain where damage begins"),)),
-    row("cyclic", "E / (1 + kappa N)", "Every reload breaks some bonds more.", make=CyclicDamage,
-        needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD,)),
+        Nuisance("threshold_strain", (0.15, 0.3), (0.0, 0.6), "strain where damage begins")),
+    row("cyclic", "E / (1 + kappa N)", "Every reload breaks some bonds more.", make=CyclicDamage, needs=(Need.RELOAD,),
+        helps=(Need.SECOND_RELOAD,)),
     parameter="damage_rate", plausible=(0.05, 4.0), source="Lemaitre (1985), J. Eng. Mater. Technol. 107, 83",
     needs=(Need.UNLOADING, Need.SEVERAL_PEAKS), helps=(Need.RELOAD,),
     equivalences=("densification_stiffening with a negative amplitude",),
-    check="cycle one particle to rising peaks: from peak to peak it unloads softer",
-    coordinates=("peak", "cycles"),
+    check="cycle one particle to rising peaks: from peak to peak it unloads softer", coordinates=("peak", "cycles"),
     opposite="densification_stiffening",
 )  # fmt: skip
-
-
-# ---- densification ---------------------------------------------------------------------------------------------------
 
 
 def _locking_power(e: Locking, _: Particle, strain: Values) -> Values:
@@ -289,7 +238,7 @@ def _locking_exponential(e: Locking, _: Particle, strain: Values) -> Values:
 class Locking(LoadingFactor):
     """Pores that close up: little at small strain, steep at large."""
 
-    exponent: Scalar = further()
+    exponent: Any = None
 
     formulas: ClassVar = {"locking": _locking_power, "locking_exponential": _locking_exponential}
 
@@ -299,33 +248,28 @@ _FOAM = "Gibson and Ashby (1997), Cellular Solids, ch. 5"
 _LOADING = {"make": Locking, "needs": (), "helps": (Need.SEVERAL_PEAKS,)}
 
 DENSIFICATION = family(
-    ModulusAtPeak,
-    "densification_stiffening",
+    Densification, "densification_stiffening",
     "Pores close while the particle is squeezed: the further it went, the stiffer it is.",
-    row("exponential", "E exp(b eps_P)", "Porosity falls with strain; E = E_0 exp(-b p).", source=_SPRIGGS,
-        direction=1.0),
-    row("linear", "E (1 + b eps_P)", "The modulus grows in proportion to strain.", source="ad hoc (this work)",
-        direction=1.0),
+    row("exponential", "E exp(b eps_P)", "Porosity falls with strain; E = E_0 exp(-b p).", source=_SPRIGGS),
+    row("linear", "E (1 + b eps_P)", "The modulus grows in proportion to strain."),
     row("cellular", "E (1 + b eps_P / 2)^2", "The square of a density that grows with strain.",
-        source="Gibson and Ashby (1982), Proc. R. Soc. A 382, 43", direction=1.0),
-    row("relative_density", "E (1 - eps_P / 2)^-b", "A power of relative density.",
-        source="Gibson and Ashby (1982)"),
-    row("square", "E exp(2 b eps_P^2)", "Stiffening that sets in late.", source="ad hoc (this work)", direction=1.0),
-    row("stress", "E exp(b sigma_P / 10 MPa)", "Stiffening driven by stress.", source="Schmalbach et al. (2021)",
-        direction=1.0),
+        source="Gibson and Ashby (1982), Proc. R. Soc. A 382, 43"),
+    row("relative_density", "E (1 - eps_P / 2)^-b", "A power of relative density.", source="Gibson and Ashby (1982)"),
+    row("square", "E exp(2 b eps_P^2)", "Stiffening that sets in late."),
+    row("stress", "E exp(b sigma_P / 10 MPa)", "Stiffening driven by stress.", source="Schmalbach et al. (2021)"),
     row("heckel", "E exp[b (1 - exp(-sigma_P / sigma_H))]",
-        "Pores close as Heckel found for tablets, and the modulus follows.", source="Heckel (1961); Spriggs (1961)",
-        nuisances=(Nuisance("heckel_stress_MPa", (3.0, 10.0), (0.5, 100.0), "stress that closes most pores"),)),
+        "Pores close as Heckel found for tablets, and the modulus follows.",
+        Nuisance("heckel_stress_MPa", (3.0, 10.0), (0.5, 100.0), "stress that closes most pores"),
+        source="Heckel (1961); Spriggs (1961)"),
     row("locking", "sigma(eps) [1 + b (eps / 0.5)^n]",
         "Loading itself stiffens at large strain, where walls of pores meet.",
-        source=f"Rusch (1969), J. Appl. Polym. Sci. 13, 2297; {_FOAM}",
-        nuisances=(Nuisance("exponent", (4.0, 8.0), (2.0, 16.0), "power of strain"),), **_LOADING),
+        Nuisance("exponent", (4.0, 8.0), (2.0, 16.0), "power of strain"),
+        source=f"Rusch (1969), J. Appl. Polym. Sci. 13, 2297; {_FOAM}", **_LOADING),
     row("locking_exponential", "sigma(eps) [1 + b (e^(k eps) - 1 - k eps) / (at eps = 0.5)]",
-        "The same, exponential in strain.", source=_FOAM,
-        nuisances=(Nuisance("exponent", (6.0, 15.0), (1.0, 40.0), "growth per strain"),), **_LOADING),
+        "The same, exponential in strain.", Nuisance("exponent", (6.0, 15.0), (1.0, 40.0), "growth per strain"),
+        source=_FOAM, **_LOADING),
     parameter="stiffening", plausible=(0.05, 4.0), needs=(Need.UNLOADING, Need.SEVERAL_PEAKS), helps=(Need.RELOAD,),
     equivalences=("damage with a negative amplitude",),
     check="cycle one particle to rising peaks, its porosity measured by tomography before and after",
-    coordinates=("peak",),
-    opposite="damage",
+    coordinates=("peak",), opposite="damage",
 )  # fmt: skip

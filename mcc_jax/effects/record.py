@@ -1,4 +1,4 @@
-"""What the instrument did, point by point: force, time, branch, cycle, rates, from segments of a test."""
+"""What an effect sees of a test: what the instrument did, point by point, and the state of the contact."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from .. import arguments
 from .._format import described
 from .._types import Scalar, ScalarLike, Values, scalar
+from ..formulas import PUNCH_AREA, Formulas, recovery
+from ..geometry import Particle
 
 KINDS = ("approach", "load", "hold", "unload", "reload")
 APPROACH, LOAD, HOLD, UNLOAD, RELOAD = range(5)
@@ -20,6 +22,19 @@ REFERENCE_HUMIDITY_PERCENT = 45.0
 """Relative humidity of a test that names none; there no effect of humidity acts."""
 
 Codes = Int[Array, "..."]
+
+
+SMALL = 1e-8
+
+
+def root(x: Values) -> Values:
+    """Square root of x >= 0 with a finite slope at zero: sqrt(x + 1e-8) - sqrt(1e-8)."""
+    return jnp.sqrt(x + SMALL) - SMALL**0.5
+
+
+def positive(x: Values) -> Values:
+    """`x` where it is above zero, else 0; no half derivative at zero."""
+    return jnp.where(x > 0, x, 0.0)
 
 
 class Record(eqx.Module):
@@ -64,13 +79,6 @@ class Record(eqx.Module):
         relative_humidity="%",
     )  # fmt: skip
 
-    @property
-    def at_points(self) -> Record:
-        """The record with its one humidity repeated at every point, for `scan`."""
-        return eqx.tree_at(
-            lambda r: r.relative_humidity, self, jnp.broadcast_to(self.relative_humidity, self.time.shape)
-        )
-
 
 def reload_progress(force: Values, reload_from: Values, peak_force: Values) -> Values:
     """Share of the way from the force where reloading began to the peak force, 0 to 1."""
@@ -96,9 +104,8 @@ def follow(before: Record, peak_force: Scalar, force: Scalar, time: Scalar) -> R
     ramp = jnp.where(force > peak_force, LOAD, jnp.where(before.branch == LOAD, LOAD, RELOAD))
     branch = jnp.where(falls, UNLOAD, jnp.where(rises, ramp, before.branch)).astype(jnp.int32)
     reloading = rises & was_unloading
-    finished = jnp.where(
-        before.reloads > 0, reload_progress(before.unload_from, before.reload_from, peak_force), jnp.zeros_like(force)
-    )
+    way = reload_progress(before.unload_from, before.reload_from, peak_force)
+    finished = jnp.where(before.reloads > 0, way, jnp.zeros_like(force))
     timed = moves & (elapsed > 0)
     rate = jnp.where(timed, jnp.abs(change) / jnp.where(timed, elapsed, 1.0), before.rate)
     return Record(
@@ -124,22 +131,15 @@ def clean_record(
     before: Record | None = None,
     peak_force: Scalar | None = None,
 ) -> Record:
-    """The record of a path without noise; every change of direction is a turning point.
+    """The record of a path without noise: forces [mN] over times [s] that never decrease; every turn is meant.
 
-    Args:
-        force: forces [mN].
-        time: times [s], never decreasing.
-        relative_humidity: [%]; the reference if None.
-        before: the point before the first, if the path continues another.
-        peak_force: the largest force up to then [mN].
+    A path may continue another: from the point `before` it, with the largest force up to then [mN].
     """
     force, time = arguments.path(force, "force"), arguments.path(time, "time")
     arguments.same_length(force=force, time=time)
-    if relative_humidity is not None:
-        relative_humidity = scalar(relative_humidity)
-    start = first_point(force.dtype, relative_humidity) if before is None else before
     if before is None:
-        start = eqx.tree_at(lambda r: r.time, start, time[0])
+        humidity = None if relative_humidity is None else scalar(relative_humidity)
+        before = eqx.tree_at(lambda r: r.time, first_point(force.dtype, humidity), time[0])
     highest = jnp.zeros_like(force[0]) if peak_force is None else peak_force
 
     def one(carry, now):
@@ -147,7 +147,107 @@ def clean_record(
         point = follow(point, peak, *now)
         return (point, jnp.maximum(peak, point.force)), point
 
-    _, points = jax.lax.scan(one, (start, highest), (force, time))
+    _, points = jax.lax.scan(one, (before, highest), (force, time))
     # The programme of the test is data: derivatives by force act through the law, not through where the branches begin.
     points = eqx.tree_at(lambda r: (r.force, r.time), jax.lax.stop_gradient(points), (force, time))
-    return eqx.tree_at(lambda r: r.relative_humidity, points, start.relative_humidity)
+    return eqx.tree_at(lambda r: r.relative_humidity, points, before.relative_humidity)
+
+
+class Context(eqx.Module):
+    """One point of a test or all of them: everything here is a scalar or an array over points.
+
+    Attributes:
+        law: the law as modified by the effects that act on its parameters; they already contain the shape where the
+            fit has taken it in (`a` = 0), so effects use strain and never the shape factor.
+        peak_force: largest force so far [mN].
+        peak_displacement: largest displacement of the law so far [um].
+        recoverable: displacement that the law recovers on full release from there [um].
+        displacement: displacement of the law [um], without additions.
+        memory: what an effect with a memory has accumulated; None for the others.
+    """
+
+    particle: Particle
+    law: Formulas
+    record: Record
+    peak_force: Values
+    peak_displacement: Values
+    recoverable: Values
+    displacement: Values
+    memory: Any = None
+
+    __repr__ = described(peak_force="mN", peak_displacement="um", recoverable="um", displacement="um")
+
+    @property
+    def force(self) -> Values:
+        """Force [mN], 0 out of contact."""
+        return positive(self.record.force)
+
+    @property
+    def stress(self) -> Values:
+        """Stress F / (pi R_e^2) [MPa]."""
+        return self.particle.stress(self.force)
+
+    @property
+    def peak_stress(self) -> Values:
+        """Largest stress so far [MPa]."""
+        return self.particle.stress(self.peak_force)
+
+    @property
+    def peak_strain(self) -> Values:
+        """Largest strain of the law so far [-]."""
+        return self.particle.strain(self.peak_displacement)
+
+    @property
+    def load_share(self) -> Values:
+        """u = F / F_P [-]: 1 on virgin loading, 0 on full release."""
+        loaded, share = self._over_peak(self.force)
+        return jnp.where(loaded & (share < 1), share, 1.0)
+
+    @property
+    def recovered_share(self) -> Values:
+        """s [-]: recovered over recoverable displacement of the law, 0 at the peak, 1 on full release."""
+        return recovery(self.load_share)
+
+    @property
+    def peak_contact_radius(self) -> Values:
+        """Radius of contact at the peak [um], D_e sqrt(c^2 eps_P), c^2 = 1.43 (Storakers, perfect plasticity)."""
+        return contact_radius(self.particle, self.peak_strain)
+
+    @property
+    def contact_radius(self) -> Values:
+        """Radius of contact now [um]; it shrinks while the particle is unloaded."""
+        return self.peak_contact_radius * contact_of(self.recovered_share)
+
+    @property
+    def reload_from_share(self) -> Values:
+        """Force at which the latest reload began, over the peak force [-]."""
+        return jnp.clip(self._over_peak(self.record.reload_from)[1], 0.0, 1.0)
+
+    def _over_peak(self, force: Values) -> tuple[Bool[Array, ...], Values]:
+        """Whether there has been a load, and a force over its peak, 0 without one."""
+        loaded = self.peak_force > jnp.finfo(self.peak_force.dtype).tiny ** 0.5
+        return loaded, jnp.where(loaded, force, 0.0) / jnp.where(loaded, self.peak_force, 1.0)
+
+    @property
+    def progress(self) -> Values:
+        """How far the present or latest reload went [-]: 0 where it began, 1 at the peak force; 0 before any reload."""
+        reached = jnp.where(self.record.branch == UNLOAD, self.record.unload_from, self.force)
+        share = reload_progress(reached, self.record.reload_from, self.peak_force)
+        return jnp.where(self.record.reloads > 0, share, 0.0)
+
+    @property
+    def cycles(self) -> Values:
+        """Reloads so far, a partial one counted in part [-]; never decreases."""
+        return self.record.progress + self.progress
+
+
+def contact_of(recovered_share: Values) -> Values:
+    """sqrt(1 - s^2), with slope zero instead of infinity at s = 1."""
+    chord = (1 - recovered_share) * (1 + recovered_share)
+    inside = chord > 0
+    return jnp.where(inside, jnp.sqrt(jnp.where(inside, chord, 1.0)), 0.0)
+
+
+def contact_radius(particle: Particle, strain: Values) -> Values:
+    """Radius of plastic contact [um] at a strain [-], 2 R_e sqrt(c^2 eps)."""
+    return particle.effective_diameter * root(PUNCH_AREA * strain)

@@ -15,7 +15,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described, in_words, number, table
 from .._types import ScalarLike, scalar
-from .effect import AbstractEffect, AbstractFormulas
+from .effect import AbstractEffect
 
 
 class Need(enum.Enum):
@@ -38,14 +38,13 @@ class Need(enum.Enum):
 class Nuisance:
     """A further number of a formula, without meaning while the amplitude is zero.
 
-    All are absolute (seconds, MPa, mN, shares of the particle's own peak), never relative to a whole test: the effect
-    can then be followed point by point.
+    It is absolute (seconds, MPa, mN, a share of the particle's own peak), never relative to a whole test, so that the
+    effect can be followed point by point.
 
     Attributes:
-        name: its name, with its unit.
+        name: with the unit.
         grid: the few values at which to look for the effect.
         plausible: smallest and largest sensible value.
-        explanation: what it is.
         random_per_test: whether every test has a value of its own.
     """
 
@@ -68,17 +67,12 @@ class Variant:
     """One formula of a mechanism.
 
     Attributes:
-        mechanism: name of the mechanism.
-        name: name of the formula within the mechanism.
         make: the class of the effect; called with the amplitude and the nuisance parameters by name.
         parameter: name of the amplitude, with its unit.
         unit: the amplitude's unit as it is printed; "-" if it has none.
         sign: +1 if only positive amplitudes are physical, -1 if only negative ones, 0 if both are.
         plausible: smallest and largest magnitude one would believe.
-        equation: the formula as text.
         explanation: what happens physically.
-        source: where the formula is from.
-        nuisances: further numbers of the formula.
         needs: what the data must contain, all of it.
         helps: what would make the effect easier to distinguish from others.
         random_per_test: whether the amplitude differs at random from test to test, with either sign.
@@ -102,8 +96,8 @@ class Variant:
     fixed: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        plausible = arguments.floats(self.plausible, "plausible", shape="two magnitudes, the smaller first")
-        if plausible.shape != (2,) or not 0 < plausible[0] < plausible[1] < math.inf:
+        low, high = self.plausible
+        if not 0 < low < high < math.inf:
             raise InputError(f"{self.label}: plausible must be two magnitudes, the smaller first")
         arguments.choice(self.sign, (-1, 0, 1), f"sign of {self.label}")
         for nuisance in self.nuisances:
@@ -113,31 +107,19 @@ class Variant:
 
     def __repr__(self) -> str:
         sign = {1: "above zero", -1: "below zero", 0: "of either sign"}[self.sign]
-        low, high = (number(value) for value in self.plausible)
+        low, high = map(number, self.plausible)
         unit = "" if self.unit == "-" else f" {self.unit}"
-        further = [
-            (n.name, f"{in_words(n.plausible[0])} to {in_words(n.plausible[1])}: {n.explanation}")
-            for n in self.nuisances
-        ]
-        rows = [
-            ("formula", self.equation),
-            (self.parameter, f"{sign}, plausible from {low} to {high}{unit}"),
-            *further,
-            ("what happens", self.explanation),
-            ("needs", ", ".join(need.value for need in self.needs) or "nothing special"),
-            ("source", self.source),
-        ]
-        return table(self.label, rows)
+        rows = [("formula", self.equation), (self.parameter, f"{sign}, plausible from {low} to {high}{unit}")]
+        for n in self.nuisances:
+            low, high = map(in_words, n.plausible)
+            rows.append((n.name, f"{low} to {high}: {n.explanation}"))
+        needs = ", ".join(need.value for need in self.needs) or "nothing special"
+        return table(self.label, [*rows, ("what happens", self.explanation), ("needs", needs), ("source", self.source)])
 
     @property
     def label(self) -> str:
         """Mechanism and formula as `find_variant` and `with_effects` take them: "creep:logarithmic"."""
         return f"{self.mechanism}:{self.name}"
-
-    @property
-    def null(self) -> float:
-        """The amplitude at which nothing is added."""
-        return 0.0
 
     @property
     def typical(self) -> float:
@@ -152,10 +134,10 @@ class Variant:
         """
         self.check_names(nuisance)
         strength = scalar(amplitude)
-        others = {
-            name: jnp.asarray(value, strength.dtype) if isinstance(value, int | float) else value
-            for name, value in {**{n.name: n.middle for n in self.nuisances}, **nuisance}.items()
-        }
+        others: dict[str, Any] = {n.name: n.middle for n in self.nuisances} | nuisance
+        for name, value in others.items():
+            plain = isinstance(value, int | float)
+            others[name] = jnp.asarray(value, strength.dtype) if plain else scalar(value)
         return replace(self.make(strength, **others, **self.fixed), label=self.label)
 
     def check_names(self, nuisance: Mapping[str, Any]) -> None:
@@ -175,8 +157,6 @@ class Mechanism:
     """A physical cause: a family of formulas, of which nature may use one, or a similar one.
 
     Attributes:
-        name: its name.
-        explanation: what it is, in plain words.
         variants: its formulas, the most common first.
         equivalences: what no data of this kind can distinguish from it; to be declared, never discovered.
         check: what would show it by itself, in addition to what more tests of the same kind would show.
@@ -195,12 +175,11 @@ class Mechanism:
     sudden: bool = False
 
     def __post_init__(self) -> None:
-        names = [variant.name for variant in self.variants]
-        if len(set(names)) < len(names):
+        if len({variant.name for variant in self.variants}) < len(self.variants):
             raise InputError(f"{self.name} has two variants of one name")
-        strangers = [v.name for v in self.variants if v.mechanism != self.name]
-        if strangers:
-            raise InputError(f"the variant {strangers[0]!r} is not one of {self.name}")
+        for variant in self.variants:
+            if variant.mechanism != self.name:
+                raise InputError(f"the variant {variant.name!r} is not one of {self.name}")
 
     def __repr__(self) -> str:
         return table(f"{self.name}: {self.explanation}", [(v.name, v.equation) for v in self.variants])
@@ -209,23 +188,20 @@ class Mechanism:
         return iter(self.variants)
 
     def __getitem__(self, name: str) -> Variant:
-        """The variant of that name.
-
-        Raises:
-            KeyError: naming the variants there are.
-        """
-        for variant in self.variants:
-            if variant.name == name:
-                return variant
-        raise KeyError(f"{self.name} has no variant {name!r}; it has: {', '.join(v.name for v in self.variants)}")
+        """The variant of that name."""
+        variants = {variant.name: variant for variant in self.variants}
+        if name not in variants:
+            raise InputError(f"{self.name} has no variant {name!r}; it has: {', '.join(variants)}")
+        return variants[name]
 
 
-def row(name: str, equation: str, explanation: str, **own: Any) -> dict[str, Any]:
+def row(name: str, equation: str, explanation: str, *nuisances: Nuisance, **own: Any) -> dict[str, Any]:
     """One formula of a `family`, with what differs from the others: fields of `Variant`, settings of the class.
 
-    Of an `AbstractFormulas` the formula is the one of the row's name unless `formula` is given.
+    Where the class has several `formulas`, this is the one of the row's name unless `formula` is given.
     """
-    return {"name": name, "equation": equation, "explanation": explanation, **own}
+    further = {"nuisances": nuisances} if nuisances else {}
+    return {"name": name, "equation": equation, "explanation": explanation, **further, **own}
 
 
 def family(
@@ -234,14 +210,22 @@ def family(
     """A mechanism from its rows.
 
     `make` is the class of the effects unless a row names another. `common` has further fields of the mechanism and
-    those of `Variant` that rows do not give; without a unit and of positive sign unless stated.
+    those of `Variant` that rows do not give; without a unit, of positive sign and our own unless stated.
     """
     of_mechanism = {f.name: common.pop(f.name) for f in fields(Mechanism) if f.name in common}
     known, variants = {f.name for f in fields(Variant)}, []
     for own in rows:
-        given = {"mechanism": name, "make": make, "unit": "-", "sign": 1, **common, **own}
+        given = {
+            "mechanism": name,
+            "make": make,
+            "unit": "-",
+            "sign": 1,
+            "source": "ad hoc (this work)",
+            **common,
+            **own,
+        }
         fixed = {key: given.pop(key) for key in list(given) if key not in known}
-        if issubclass(given["make"], AbstractFormulas):
+        if given["make"].formulas:
             fixed.setdefault("formula", given["name"])
         variants.append(Variant(**given, fixed=fixed))
     return Mechanism(name, explanation, tuple(variants), **of_mechanism)
@@ -249,13 +233,7 @@ def family(
 
 @dataclass(frozen=True)
 class Equivalence:
-    """Two or more descriptions that fit every possible measurement equally well.
-
-    Attributes:
-        names: what cannot be distinguished.
-        explanation: why.
-        broken_by: the measurement that would distinguish them.
-    """
+    """Two or more descriptions that fit every possible measurement equally well, and what would distinguish them."""
 
     names: tuple[str, ...]
     explanation: str
@@ -265,40 +243,25 @@ class Equivalence:
 
 
 EQUIVALENCES = (
-    Equivalence(
-        ("load-cell gain", "C1, C3^3, C5^5 and the effective modulus scaled alike"),
+    Equivalence(("load-cell gain", "C1, C3^3, C5^5 and the effective modulus scaled alike"),
         "A force read too high by a constant factor scales every stress; the law scales with it.",
-        "a calibration weight on the load cell",
-    ),
-    Equivalence(
-        ("zero of force", "zero of displacement"),
+        "a calibration weight on the load cell"),
+    Equivalence(("zero of force", "zero of displacement"),
         "A small shift of force at first contact moves the curve along itself, as a shift of displacement does.",
-        "a record of the approach before contact",
-    ),
-    Equivalence(
-        ("shape parameter a", "mean of C1, C3 and C5"),
+        "a record of the approach before contact"),
+    Equivalence(("shape parameter a", "mean of C1, C3 and C5"),
         "If all particles have the same flatness, a multiplies all coefficients by one number.",
-        "particles of several shapes",
-    ),
-    Equivalence(
-        ("thermal_drift linear", "frame_compliance linear, on loading at one rate"),
+        "particles of several shapes"),
+    Equivalence(("thermal_drift linear", "frame_compliance linear, on loading at one rate"),
         "While force grows in proportion to time, both add displacement in proportion to force.",
-        "unloading, a hold, or a second rate",
-    ),
-    Equivalence(
-        ("damage", "densification_stiffening of opposite sign"),
+        "unloading, a hold, or a second rate"),
+    Equivalence(("damage", "densification_stiffening of opposite sign"),
         "One says that the modulus falls with peak strain, the other that it grows; the sign decides between them.",
-        "nothing is needed: amplitudes below zero are not physical",
-    ),
-    Equivalence(
-        ("rate_dependence", "size_effect, at one force rate"),
-        "At one force rate the strain rate goes as the inverse square of size.",
-        "two rates in one class of size",
-    ),
-    Equivalence(
-        ("finite width of the punch", "nothing"),
+        "nothing is needed: amplitudes below zero are not physical"),
+    Equivalence(("rate_dependence", "size_effect, at one force rate"),
+        "At one force rate the strain rate goes as the inverse square of size.", "two rates in one class of size"),
+    Equivalence(("finite width of the punch", "nothing"),
         "As long as no contact is wider than the punch, its width changes nothing.",
-        "particles whose contact outgrows the punch",
-    ),
-)
+        "particles whose contact outgrows the punch"),
+)  # fmt: skip
 """What must be declared and can never be discovered."""

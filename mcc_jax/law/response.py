@@ -96,7 +96,7 @@ def whole_path(
     highest = peak_forces(record, memory.peak_force)
     context = modified(law, effects, particle, displacement_max, record, highest, hold_virgin(record))
     own, drivers, added = additions(effects, memory, context)
-    point, highest = jax.tree.map(lambda x: x[-1], (record.at_points, highest))
+    point, highest = jax.tree.map(lambda x: x[-1] if x.ndim else x, (record, highest))
     after = Memory(point, highest, own, drivers)
     return context.peak_displacement[-1], after, context.displacement + added
 
