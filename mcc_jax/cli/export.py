@@ -22,7 +22,7 @@ FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
     "--diameters",
     metavar="D1,D2,D3|FILE",
     help="Diameters in um of the particle that the golden table shows, or a table of particles (its row of that "
-    "particle, or its mean).  [default: particles.csv in DIR or DIR/campaign, else a sphere of 200 um]",
+    "particle, or its mean).  [default: the particles of the calibrated campaign]",
 )
 @click.option(
     "--allow-not-monotone", is_flag=True, help="Export a law whose stress falls on loading, instead of refusing it."

@@ -19,11 +19,10 @@ from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
 from ..law.response import factor_at_peak, folded
-from .card import in_words
-from .origin import SPHERE_UM, Origin, checked, numbers
+from .origin import UNKNOWN, Origin, check, effects_of, numbers
 
 
-def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> str:
+def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKNOWN) -> str:
     """A C99 header, valid as C++, in SI units, with the law's numbers as an initialiser.
 
     It holds force, tangent and history of one particle between platens, and of a pair of half contacts, for all forms
@@ -36,60 +35,52 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
             formula or makes a contact gain energy. A law that is not monotone is passed on, unlike by
             `read_calibration`: a pair of such contacts has several solutions.
     """
-    origin = checked(law, particle, origin, needed=False)
-    return _render(
-        "mcc_law.h.j2",
+    return _rendered("mcc_law.h.j2", law, particle, origin)
+
+
+def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin = UNKNOWN) -> str:
+    """Markdown: a normal model for LAMMPS' `pair_style granular` around the header of `c_header`, with the values."""
+    return _rendered("lammps.md.j2", law, particle, origin)
+
+
+def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin = UNKNOWN) -> str:
+    """Markdown: material, `Ip2` and `Law2` functors for Yade around the header of `c_header`, with the values."""
+    return _rendered("yade.md.j2", law, particle, origin)
+
+
+def _rendered(template: str, law: MccLaw, particle: Particle | None, origin: Origin) -> str:
+    """A template with the law's values put in, in SI units; a value it wants and does not get is an error."""
+    with extra("export"):
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    check(law, particle)
+    values = numbers(law)
+    environment = Environment(
+        loader=PackageLoader("mcc_jax.export"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True, autoescape=False,  # C and Markdown, not HTML
+    )  # fmt: skip
+    return environment.get_template(template).render(
+        **{name: repr(values[name]) for name in ("C1", "C3", "C5", "a")},
+        modulus=repr(values["effective_modulus_MPa"] * 1e6),
         parameters=parameters_in_c(law),
         factor=factor_in_c(law, particle),
         effects=_quoted(", ".join(effect.name for effect in law.effects))[1:-1],
         version=own_version(),
         origin=_origin_lines(law, particle, origin),
         strain_max=TESTED_STRAIN,
-        forms=[{"name": one.name, "constant": repr(one.constant), "power": one.stress_power} for one in Unloading],
-        scalings=[{"name": scaling.name, "power": scaling.power} for scaling in StrainScaling],
+        forms=Unloading,
+        scalings=StrainScaling,
         form=law.unloading.name,
         scaling=law.strain_scaling.name,
-        **_values(law),
     )
-
-
-def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
-    """Markdown: a normal model for LAMMPS' `pair_style granular` around the header of `c_header`, with the values.
-
-    Arguments and errors as of `c_header`; the particle is that of the golden table.
-    """
-    return _recipe("lammps.md.j2", law, particle, origin)
-
-
-def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
-    """Markdown: material, `Ip2` and `Law2` functors for Yade around the header of `c_header`, with the values.
-
-    Arguments and errors as of `lammps_recipe`.
-    """
-    return _recipe("yade.md.j2", law, particle, origin)
-
-
-def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin | None) -> str:
-    origin = checked(law, particle, origin)
-    return _render(
-        name,
-        version=own_version(),
-        factor=factor_in_c(law, particle),
-        origin=[f"- {line}" for line in _origin_lines(law, particle, origin)],
-        **_values(law),
-    )
-
-
-def _values(law: MccLaw) -> dict[str, str]:
-    """The five numbers of a law as C writes them, SI."""
-    values = numbers(law)
-    return {"modulus": repr(values.pop("effective_modulus_MPa") * 1e6), **{k: repr(v) for k, v in values.items()}}
 
 
 def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
     """Where the values come from, a fact a line."""
     lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
-    lines += [_quoted(line)[1:-1] for line in in_words(law)]
+    for one in effects_of(law):
+        values = ", ".join(f"{name} = {value:.6g}" for name, value in one["numbers"].items())
+        lines.append(_quoted(f"Effect {one['name']}: {one['equation']}; {values}.")[1:-1])
     if origin.calibration is not None:
         c = origin.calibration
         file, method = _quoted(str(c["file"])), _quoted(str(c["method"]))
@@ -106,31 +97,13 @@ def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> lis
     return lines
 
 
-def _render(name: str, **values: Any) -> str:
-    """The template of that name with the values put in; a value it wants and does not get is an error."""
-    with extra("export"):
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("mcc_jax.export"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True, autoescape=False,  # C and Markdown, not HTML
-    )  # fmt: skip
-    return environment.get_template(name).render(**values)
-
-
 def _quoted(text: str) -> str:
     """Any text in one line of ASCII that ends no comment, string or code block, wherever it is put."""
     return json.dumps(text, ensure_ascii=True).replace("*", "\\u002a").replace("`", "\\u0060").replace("?", "\\u003f")
 
 
-# ---- effects: as C where they are closed formulas of particle and peak ---------------------------------------------
-
-
 def parameters_in_c(law: MccLaw) -> str | None:
-    """C statements that put what effects make of `law` for a particle into `own`; None if no effect changes parameters.
-
-    They read C1, C3, C5, a and effective_modulus of `*law`, and D1, D2, D3, all SI.
-    """
+    """C statements that put what effects make of `*law` for D1, D2, D3 into `own`, all SI; None if nothing changes."""
     if not any(effect.overrides("modify") for effect in law.effects):
         return None
 
@@ -145,13 +118,8 @@ def parameters_in_c(law: MccLaw) -> str | None:
 
 
 def factor_in_c(law: MccLaw, particle: Particle | None) -> str | None:
-    """C statements that return the factor on the modulus at `strain` and `stress` [MPa]; None if there is none.
-
-    Raises:
-        InputError: naming an effect that no particle code can take.
-    """
-    sphere = Particle(SPHERE_UM, SPHERE_UM, SPHERE_UM)
-    at_peak = half_contact(law, sphere if particle is None else particle).effects
+    """C statements that return the factor on the modulus at `strain` and `stress` [MPa]; None if there is none."""
+    at_peak = half_contact(law, Particle(200.0, 200.0, 200.0) if particle is None else particle).effects
     if not at_peak:
         return None
     lines, results = in_c(lambda strain, stress: (factor_at_peak(at_peak, strain, stress),), ["strain", "stress"])
@@ -174,10 +142,8 @@ _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> tuple[list[str], list[str]]:
     """A function of as many scalars as names as C: the statements, and what to write for each result.
 
-    JAX traces it; so C computes what the library computes, of an effect of the user's own, too.
-
-    Raises:
-        InputError: for an operation that has no counterpart in C.
+    JAX traces it; so C computes what the library computes, of an effect of the user's own, too. An operation that has
+    no counterpart in C raises `InputError`.
     """
     traced = jax.make_jaxpr(function)(*(jnp.ones(()) for _ in names))
     statements: list[tuple[str, str, str]] = []
@@ -194,14 +160,23 @@ def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> t
             return written(atom.val) if hasattr(atom, "val") else known[atom]
 
         for equation in jaxpr.eqns:
-            results = list(map(read, equation.invars))
-            if equation.primitive.name in _CALLS:
+            name, kind, results = equation.primitive.name, equation.outvars[0].aval, list(map(read, equation.invars))
+            if name in _CALLS:
                 inner = next(p for p in equation.params.values() if hasattr(p, "jaxpr"))
                 results = follow(inner.jaxpr, inner.consts, results)
-            elif equation.primitive.name not in _THE_SAME or equation.outvars[0].aval.ndim:
-                kind = "int" if equation.outvars[0].aval.dtype.kind == "b" else "double"
-                statements.append((kind, f"t{len(statements)}", _operation(equation, results)))
-                results = [statements[-1][1]]
+            elif name not in _THE_SAME or kind.ndim:
+                if name == "integer_pow":
+                    product = " * ".join(results * abs(equation.params["y"]))
+                    expression = product if equation.params["y"] > 0 else f"1.0 / ({product})"
+                elif name in _OPERATIONS and not kind.ndim:
+                    expression = _OPERATIONS[name].format(*results)
+                else:
+                    raise InputError(
+                        f"an effect of this law takes the operation {name}, which has no counterpart in C",
+                        remedy="Export the law as a JAX artefact (--format jax), or leave that effect out.",
+                    )
+                results = [f"t{len(statements)}"]
+                statements.append(("int" if kind.dtype.kind == "b" else "double", results[0], expression))
             known.update(zip(equation.outvars, results, strict=True))
         return list(map(read, jaxpr.outvars))
 
@@ -212,16 +187,3 @@ def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> t
             needed.update(re.findall(r"\bt\d+\b", expression))
             lines.insert(0, f"const {kind} {name} = {expression};")
     return lines, results
-
-
-def _operation(equation: Any, inputs: Sequence[str]) -> str:
-    name = equation.primitive.name
-    if name == "integer_pow":
-        product = " * ".join([inputs[0]] * abs(equation.params["y"]))
-        return product if equation.params["y"] > 0 else f"1.0 / ({product})"
-    if name not in _OPERATIONS or equation.outvars[0].aval.ndim:
-        raise InputError(
-            f"an effect of this law takes the operation {name}, which has no counterpart in C",
-            remedy="Export the law as a JAX artefact (--format jax), or leave that effect out.",
-        )
-    return _OPERATIONS[name].format(*inputs)

@@ -16,7 +16,7 @@ from .._extras import extra
 from .._format import described
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
-from .origin import checked
+from .origin import check
 
 Which = Literal["force", "step", "step_each", "step_load"]
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -27,15 +27,18 @@ _ALL = "particles of any size, each with coefficients of its own; a and the modu
 def signatures(law: MccLaw) -> dict[Which, dict[str, Any]]:
     """The functions there are of a law, with arguments and results; effects need time and a memory."""
     x, past, F = "displacement_um (b,)", "displacement_max_um (b,)", "force_mN (b,)"
-    memory = ["what `memory` lists, one by one"] if law.effects else []
-    second = "time_s (b,)" if law.effects else past
-    results = [F, "tangent_mN_per_um (b,)", *(memory or [f"{past} after the step"])]
     each = ["diameters_um D1, D2, D3 (b, 3)", "coefficients C1, C3, C5 (b, 3)"]
-    one: dict[Which, dict[str, Any]] = {"force": {"arguments": [x, past], "results": [F], "of": _OWN}}
     if law.effects:
-        one = {"step_load": {"arguments": [F, second, *memory], "results": [x, *memory], "of": _OWN}}
+        second, memory = "time_s (b,)", ["what `memory` lists, one by one"]
+        other: Which = "step_load"
+        first = {"arguments": [F, second, *memory], "results": [x, *memory], "of": _OWN}
+    else:
+        second, memory = past, []
+        other = "force"
+        first = {"arguments": [x, past], "results": [F], "of": _OWN}
+    results = [F, "tangent_mN_per_um (b,)", *(memory or [f"{past} after the step"])]
     return {
-        **one,
+        other: first,
         "step": {"arguments": [x, second, *memory], "results": results, "of": _OWN},
         "step_each": {"arguments": [x, second, *each, *memory], "results": results, "of": _ALL},
     }
@@ -86,33 +89,32 @@ def jax_artefact(
     """
     with extra("export"):
         import flatbuffers  # noqa: F401
-    checked(law, particle)
+    check(law, particle)
     functions = signatures(law)
     arguments.choice(which, functions, "which")
     arguments.choice(dtype, ("float64", "float32"), "dtype")
-    if isinstance(platforms, str) or not platforms:
-        raise InputError(f"platforms must be a list of names, got {platforms!r}", remedy=f"Some of {PLATFORMS}.")
     for name in platforms:
         arguments.choice(name, PLATFORMS, "platform")
     if dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError(
-            "JAX is in single precision", remedy='Call jax.config.update("jax_enable_x64", True) or take float32'
-        )
+        remedy = 'Call jax.config.update("jax_enable_x64", True) or take float32'
+        raise InputError("JAX is in single precision", remedy=remedy)
     law, particle = (
         jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree) for tree in (law, particle)
     )
+    start, structure = jax.tree_util.tree_flatten_with_path(law.init(particle))
     (batch,) = jax.export.symbolic_shape("b")
-    start, structure = jax.tree.flatten(law.init(particle))
-    one = jax.ShapeDtypeStruct((batch,), jnp.dtype(dtype))
-    triple = jax.ShapeDtypeStruct((batch, 3), jnp.dtype(dtype))
+    one, triple = (jax.ShapeDtypeStruct((batch, *shape), jnp.dtype(dtype)) for shape in ((), (3,)))
     inputs = [one, one, triple, triple] if which == "step_each" else [one, one]
+    memory = []
     if law.effects:
-        inputs += [jax.ShapeDtypeStruct((batch, *leaf.shape), leaf.dtype) for leaf in start]
+        inputs += [jax.ShapeDtypeStruct((batch, *leaf.shape), leaf.dtype) for _, leaf in start]
+        named = [(jax.tree_util.keystr(path).removeprefix("."), leaf) for path, leaf in start]
+        memory = [{"name": n, "shape": [*x.shape], "dtype": str(x.dtype), "start": x.tolist()} for n, x in named]
     function = jax.jit(jax.vmap(_function(law, particle, which, structure)))
     exported = jax.export.export(function, platforms=tuple(platforms))(*inputs)
     signature = {
         **functions[which],
-        **({"memory": _memory(law, particle)} if law.effects else {}),
+        **({"memory": memory} if law.effects else {}),
         "dtype": dtype,
         "batch_size": "symbolic",
         "reverse_mode": "one order",
@@ -121,15 +123,6 @@ def jax_artefact(
         "jax": jax.__version__,
     }
     return Artefact(f"{which}_{dtype}", bytes(exported.serialize(vjp_order=1)), signature)
-
-
-def _memory(law: MccLaw, particle: Particle) -> list[dict[str, Any]]:
-    """The memory of a virgin particle, array by array."""
-    leaves = [
-        (jax.tree_util.keystr(path).removeprefix("."), leaf)
-        for path, leaf in jax.tree_util.tree_flatten_with_path(law.init(particle))[0]
-    ]
-    return [{"name": n, "shape": list(x.shape), "dtype": str(x.dtype), "start": x.tolist()} for n, x in leaves]
 
 
 def _function(law: MccLaw, particle: Particle, which: Which, structure: Any) -> Callable[..., Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import inspect
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -19,12 +20,14 @@ from ..calibrate.estimates import entry_of, exponential
 from ..calibrate.population import COEFFICIENTS
 from ..calibrate.results import ARCHIVE, load
 from ..campaign import Campaign, read_diameters
+from ..effects import LIBRARY
 from ..geometry import Particle
 from ..law import MccLaw
 
-PARTICLES = "particles.csv"
-SPHERE_UM = 200.0
+HUGE = 1e44
+"""Above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite."""
 _AGAIN = "Give a folder that mcc-jax calibrate or discover wrote, or calibrate again"
+_FALLING = "the loading curve is not monotone (9 C3^6 > 20 C1 C5^5): stress falls over part of the loading"
 
 
 @dataclass(frozen=True)
@@ -40,14 +43,17 @@ class Origin:
         warnings: what a user of the values must know.
     """
 
-    estimates: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    population: Mapping[str, Mapping[str, Any]] | None = None
-    calibration: Mapping[str, Any] | None = None
+    estimates: dict[str, dict[str, Any]] = field(default_factory=dict)
+    population: dict[str, dict[str, Any]] | None = None
+    calibration: dict[str, Any] | None = None
     particle: str | None = None
     geometry: str = "given"
     warnings: tuple[str, ...] = ()
 
     __repr__ = described()
+
+
+UNKNOWN = Origin()
 
 
 def numbers(law: MccLaw) -> dict[str, float]:
@@ -57,56 +63,39 @@ def numbers(law: MccLaw) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-HUGE = 1e44
-"""Above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite."""
+def effects_of(law: MccLaw) -> list[dict[str, Any]]:
+    """The effects of a law: name, equation, the amplitude's unit where it is known, and numbers by name."""
+    effects = []
+    for effect in law.effects:
+        mechanism, _, name = effect.name.partition(":")
+        known = next((v for v in LIBRARY.get(mechanism, ()) if v.name == name), None)
+        values = {one.name: getattr(effect, one.name) for one in fields(effect)}
+        values = {name: float(value) for name, value in values.items() if eqx.is_inexact_array(value)}
+        if known is None:
+            more = {"equation": (inspect.getdoc(effect) or "").partition("\n")[0]}
+        else:
+            more = {"equation": known.equation, "unit": known.unit}
+            values = {known.parameter: values.pop("amplitude"), **values}
+        effects.append({"name": effect.name, **more, "numbers": values})
+    return effects
 
 
-def checked(law: Any, particle: Any, origin: Any = None, *, needed: bool = True) -> Origin:
-    """The origin, or an empty one, of a law that can be exported and a particle that it carries, if one is `needed`.
-
-    Raises:
-        InputError: without a particle that is needed, for a batch of laws, or a law or particle that is not usable.
-    """
-    if needed and particle is None:
-        raise InputError("particle must be given", remedy="Make one with mcc_jax.Particle(D1, D2, D3), in um.")
+def check(law: MccLaw, particle: Particle | None, *, monotone: bool = False) -> None:
+    """Raise `InputError` for a law or a particle that cannot be exported."""
     if law.plastic.C1.ndim or law.a.ndim or (particle is not None and particle.D3.ndim):
         raise InputError("a batch of laws or particles cannot be exported", remedy="Export one law.")
-    sphere = Particle(1.0, 1.0, 1.0)  # every law carries it
-    check(law, sphere if particle is None else particle, allow_not_monotone=True)
-    return origin or Origin()
-
-
-def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) -> tuple[str, ...]:
-    """Warnings about a law for other engines.
-
-    Raises:
-        InputError: if a parameter is out of its range, the particle carries no stress, or the loading curve falls and
-            that is not allowed.
-    """
     if not bool(law.is_valid) or not all(abs(number) < HUGE for number in numbers(law).values()):
+        remedy = f"C1, C5 and the modulus must be positive, and all below {HUGE:g}"
+        raise InputError(f"the law is not usable: {numbers(law)}", remedy=remedy)
+    if particle is not None and not bool(law.carries_stress(particle)):
+        sizes, eta = ", ".join(f"{float(d):g}" for d in jax.tree.leaves(particle)), float(law.shape_factor(particle))
         raise InputError(
-            f"the law is not usable: {numbers(law)}",
-            remedy=f"C1, C5 and the modulus must be positive, and all below {HUGE:g}",
-        )
-    if not bool(law.carries_stress(particle)):
-        sizes = ", ".join(f"{float(d):g}" for d in jax.tree.leaves(particle))
-        raise InputError(
-            f"the shape factor of a particle of {sizes} um is {float(law.shape_factor(particle)):.4g} "
-            f"with a = {float(law.a):.4g}",
+            f"the shape factor of a particle of {sizes} um is {eta:.4g} with a = {float(law.a):.4g}",
             remedy="Give --diameters of a rounder particle: shape factors must be positive",
         )
-    if bool(law.is_monotone):
-        return ()
-    problem = "the loading curve is not monotone (9 C3^6 > 20 C1 C5^5): stress falls over part of the loading"
-    if not allow_not_monotone:
-        raise InputError(
-            problem,
-            remedy="Take the population or another particle, or give --allow-not-monotone to export it as it is",
-        )
-    return (f"{problem}; under load control it snaps through, and a pair of such contacts has several solutions",)
-
-
-# ---- from a folder of results ----------------------------------------------------------------------------------------
+    if monotone and not bool(law.is_monotone):
+        remedy = "Take the population or another particle, or give --allow-not-monotone to export it as it is"
+        raise InputError(_FALLING, remedy=remedy)
 
 
 def read_calibration(
@@ -120,12 +109,9 @@ def read_calibration(
     Args:
         folder: what `mcc_jax.load` reads.
         particle: take this particle's coefficients.
-        diameters: `D1,D2,D3` [um], or a table of particles (its row of that particle, or its mean). If None, those of
-            the calibrated campaign or of a `particles.csv` next to it; without one, a sphere of 200 um.
+        diameters: `D1,D2,D3` [um], or a table of particles; if None, those of the calibrated campaign. Of several, that
+            particle's own, or the mean.
         allow_not_monotone: warn of a loading curve that falls, instead of refusing it.
-
-    Returns:
-        The law, the particle, and where they come from.
 
     Raises:
         InputError: naming the file, what is wrong with it and what to do.
@@ -134,78 +120,61 @@ def read_calibration(
     found = load(path)
     if isinstance(found, Campaign):
         raise InputError(f"{ARCHIVE} is missing", file=path, remedy=_AGAIN)
-    content = found.to_json()
     file = path / found.content_file
     try:
-        entry = None if particle is None else entry_of(content, particle)
-        sizes, geometry = _sizes(found, path, particle, diameters)
-        law = found.law(particle)
-        observed = [effect.name for effect in law.effects if effect.of_instrument]
-        law = law.of_particle()
-        notes = check(law, sizes, allow_not_monotone=allow_not_monotone)
+        whole = found.law(particle)
+        law = whole.of_particle()
+        shown, geometry = _sizes(found, particle, diameters)
+        check(law, shown, monotone=not allow_not_monotone)
     except InputError as error:
         if error.file is not None:
             raise
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
-    if observed:
-        notes = (*notes, f"{', '.join(observed)} belong to the instrument, not to the particle, and are left out")
-    return law, sizes, _origin(content, entry, law, file, particle, geometry, notes)
-
-
-def _origin(
-    content: Mapping[str, Any],
-    entry: Mapping[str, Any] | None,
-    law: MccLaw,
-    file: Path,
-    particle: str | None,
-    geometry: str,
-    notes: tuple[str, ...],
-) -> Origin:
-    numbers = content.get("parameters_after") or content.get("parameters_before") or content  # of a discovery
-    logs = {f"log_{name}": numbers[f"log_{name}"] for name in COEFFICIENTS}
-    estimates = {name: numbers[name] for name in ("a", "effective_modulus_MPa")}
-    if entry is None:
+    content = found.to_json()
+    converged = content.get("converged", True)
+    values = content.get("parameters_after") or content.get("parameters_before") or content  # of a discovery
+    if particle is not None and values is not content:
+        values = found.posterior.to_json()
+    logs = {f"log_{name}": values[f"log_{name}"] for name in COEFFICIENTS}
+    estimates = {name: values[name] for name in ("a", "effective_modulus_MPa")}
+    if particle is None:
         estimates |= {name: exponential(logs[f"log_{name}"]["mean"]) for name in COEFFICIENTS}
     else:
-        estimates |= {name: entry[name] for name in COEFFICIENTS}
-        if float(law.a) != numbers["a"]["value"]:
+        estimates |= {name: entry_of(values, particle)[name] for name in COEFFICIENTS}
+        if float(law.a) != values["a"]["value"]:
             estimates["a"] = {"value": float(law.a), "sd": None, "interval_95": None}
-    warnings = [] if content.get("converged", True) else [f"the calibration of {file.name} did not converge"]
+    warnings = [] if converged else [f"the calibration of {file.name} did not converge"]
     warnings += content.get("warnings", [])
-    if entry is None and content.get("modulus_scatter") is not None:
+    if particle is None and content.get("modulus_scatter") is not None:
         warnings.append("moduli scatter between particles in this calibration; this is the population's")
+    if not bool(law.is_monotone):
+        warnings.append(
+            f"{_FALLING}; under load control it snaps through, and a pair of such contacts has several solutions"
+        )
+    if observed := [effect.name for effect in whole.effects if effect.of_instrument]:
+        warnings.append(f"{', '.join(observed)} belong to the instrument, not to the particle, and are left out")
     calibration = {
         "file": file.name,
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
         "method": content.get("method", "discover"),
-        "converged": content.get("converged", True),
+        "converged": converged,
         "seed": content.get("seed"),
     }
-    return Origin(estimates, logs, calibration, particle, geometry, (*warnings, *notes))
+    return law, shown, Origin(estimates, logs, calibration, particle, geometry, tuple(warnings))
 
 
-def _sizes(found: Any, folder: Path, particle: str | None, diameters: str | None) -> tuple[Particle, str]:
-    table = next((t for t in (folder / PARTICLES, folder / "campaign" / PARTICLES) if os.path.lexists(t)), None)
-    campaign = getattr(found, "campaign", None)
-    if diameters is None and table is None and campaign is None:
-        if particle is not None:
-            raise InputError(
-                f"the size of particle {particle!r} is not known",
-                file=folder,
-                remedy="Give --diameters D1,D2,D3 in um, or the campaign's particles.csv",
-            )
-        return Particle(SPHERE_UM, SPHERE_UM, SPHERE_UM), f"a sphere of {SPHERE_UM:g} um: no diameters were given"
-    source = str(table) if diameters is None else diameters
-    if diameters is None and campaign is not None:
+def _sizes(found: Any, particle: str | None, diameters: str | None) -> tuple[Particle, str]:
+    """The particle that is shown, and where its diameters are from."""
+    if diameters is None:
+        campaign = getattr(found, "base", found).campaign
         source, given = "the calibrated campaign", dict(zip(campaign.particles, campaign.diameters_um, strict=True))
     else:
-        given = read_diameters(source)
+        source, given = Path(diameters).name, read_diameters(diameters)
     if not isinstance(given, Mapping):
         return Particle(*given), "given"
     if particle is None:
-        D1, D2, D3 = np.array([list(triple) for triple in given.values()]).mean(axis=0).tolist()
-        return Particle(D1, D2, D3), f"mean diameters of the {len(given)} particles of {Path(source).name}"
+        D1, D2, D3 = np.array(list(given.values())).mean(axis=0).tolist()
+        return Particle(D1, D2, D3), f"mean diameters of the {len(given)} particles of {source}"
     if particle not in given:
-        raise InputError(f"there is no particle {particle!r}", file=source, remedy="Give --diameters D1,D2,D3 in um")
-    D1, D2, D3 = (float(d) for d in given[particle])
-    return Particle(D1, D2, D3), f"particle {particle} of {Path(source).name}"
+        raise InputError(f"there is no particle {particle!r}", file=diameters, remedy="Give --diameters D1,D2,D3 in um")
+    return Particle(*map(float, given[particle])), f"particle {particle} of {source}"

@@ -1,13 +1,13 @@
-"""The law as two tables: the master loading curve and the unloading curve, fine enough for linear interpolation."""
+"""The law as tables: master curves for linear interpolation, and golden paths that any implementation is checked by."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -16,13 +16,14 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._numerics import compiled_whole
-from ..dem import HalfContact, half_contact
-from ..formulas import Contact, Formulas
+from .._types import Scalar
+from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_force, wall_recovery
+from ..formulas import Contact
 from ..formulas.contact import SHARE
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, stress_ratio
 from ..law.response import folded
-from .origin import checked
+from .origin import check
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,10 +32,19 @@ if TYPE_CHECKING:
 else:
     Table = object
 
-Curves = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Columns = dict[str, np.ndarray]
 MIN_ROWS, MAX_ROWS = 64, 65536
 BETWEEN = 8  # points at which an interval is checked
 CORNERS = 4096  # intervals in which a corner is looked for
+
+Units = Literal["um_mN", "SI"]
+SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
+RANDOM_PATHS, STEPS = 8, 40
+SMALL = np.array([1e-6, 1e-4, 3e-3, 1e-2, 2e-2, 5e-2])
+"""Peaks of the last path over the largest displacement: there the recovered strain leaves its limit for its formula."""
+# Shares of the recoverable displacement on the way down; 1 itself is left out, where a tangent is all rounding.
+SHARES = np.array([1e-9, 1e-3, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99, 0.9999, 1.001, 1.5])
+OTHER_SIZE = 0.6
 
 
 @dataclass(frozen=True)
@@ -74,81 +84,69 @@ def curve_tables(
     """
     import pandas as pd
 
-    checked(law, particle, needed=bool(getattr(law, "effects", ())))
+    check(law, particle)
     strain_max = arguments.number(strain_max, "strain_max", above=0)
     tolerance = arguments.number(tolerance, "tolerance", above=0)
     formulas, side = law.formulas, None
-    if law.effects and particle is not None:
+    if law.effects:
+        if particle is None:
+            raise InputError("particle must be given", remedy="Make one with mcc_jax.Particle(D1, D2, D3), in um.")
         side = half_contact(law, particle)
         formulas, _ = folded(formulas, law.effects, particle, "the tables")
-
-    at = partial(_at, formulas, side)
-    corners = _corners(lambda t: at(strain_max * t**3))
-    loading, one = _refine(lambda t: _loading(x := strain_max * t**3, at(x)), tolerance, corners)
-    unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
-    return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))
-
-
-def _loading(x: np.ndarray, curves: Curves) -> dict[str, np.ndarray]:
-    secant, tangent, formula, limit = curves
-    return {
-        "scaled_strain": x,
-        "stress_MPa": x * secant,
-        "tangent_MPa": np.where(secant > 0, tangent, 0.0),
-        "recovered_strain_at_eta_1": np.minimum(formula, limit),
-        "recovered_strain_formula_at_eta_1": formula,
-    }
-
-
-def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> Curves:
-    """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
     n, k = law.unloading.stress_power, law.unloading.constant
-    contact = Contact(*law.plastic.polynomial, 1 / (k * law.effective_modulus**n), power=n)
-    if side is not None:
-        ratio = side.at_peak(jnp.asarray(side.tested / TESTED_STRAIN * x)).c / side.c
-        contact = eqx.tree_at(lambda one: one.c, contact, contact.c * ratio)
-    secant, tangent, formula, limit = map(np.asarray, _curves(contact, jnp.asarray(x)))
-    return secant, tangent, formula, limit
+    plain = Contact(*formulas.plastic.polynomial, 1 / (k * formulas.effective_modulus**n), power=n)
+
+    def curves(t: np.ndarray) -> Columns:
+        x, contact = strain_max * t**3, plain
+        if side is not None:
+            ratio = side.at_peak(jnp.asarray(side.tested / TESTED_STRAIN * x)).c / side.c
+            contact = eqx.tree_at(lambda one: one.c, contact, contact.c * ratio)
+        values = map(np.asarray, _curves(contact, jnp.asarray(x)))
+        return {"x": x, **dict(zip(("secant", "tangent", "formula", "limit"), values, strict=True))}
+
+    def loading(t: np.ndarray) -> Columns:
+        at = curves(t)
+        return {
+            "scaled_strain": at["x"],
+            "stress_MPa": at["x"] * at["secant"],
+            "tangent_MPa": np.where(at["secant"] > 0, at["tangent"], 0.0),
+            "recovered_strain_at_eta_1": np.minimum(at["formula"], at["limit"]),
+            "recovered_strain_formula_at_eta_1": at["formula"],
+        }
+
+    def unloading(t: np.ndarray) -> Columns:
+        s = 1 - (1 - t) ** 2
+        return {"recovered_share": s, "stress_share": np.asarray(stress_ratio(jnp.asarray(s)))}
+
+    up, one = _refined(loading, tolerance, _corners(curves))
+    down, other = _refined(unloading, tolerance, [])
+    return CurveTables(pd.DataFrame(up), pd.DataFrame(down), max(one, other))
 
 
 @compiled_whole
 def _curves(contact: Contact, x: Array) -> tuple[Array, Array, Array, Array]:
+    """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
     top, bottom, _ = contact.limit(x)
     return contact.secant(x), contact.tangent(x), jnp.sqrt(contact.formula_squared(x)), top / bottom
 
 
-def _corners(at: Callable[[np.ndarray], Curves]) -> np.ndarray:
+def _corners(curves: Callable[[np.ndarray], Columns]) -> list[float]:
     """Where the recovered strain bends sharply, as t: its limit begins to hold, or ends to."""
-
     from scipy.optimize import brentq
 
-    def excess(t: np.ndarray) -> np.ndarray:
-        _, _, formula, limit = at(t)
-        return formula - limit
-
-    def steepness(t: np.ndarray) -> np.ndarray:
-        secant, tangent, _, _ = at(t)
-        return tangent - SHARE * secant
+    def gaps(t: np.ndarray) -> np.ndarray:
+        at = curves(t)
+        return np.stack([at["formula"] - at["limit"], at["tangent"] - SHARE * at["secant"]])
 
     t, found = np.linspace(0.0, 1.0, CORNERS + 1), []
-    for of in (excess, steepness):
-        sign = np.sign(of(t))
-        crossed = np.flatnonzero(sign[1:] * sign[:-1] < 0)
-        found += [brentq(lambda t, of=of: of(np.array([t]))[0], t[i], t[i + 1], xtol=1e-15) for i in crossed]
-    return np.asarray(found)
+    for k, sign in enumerate(np.sign(gaps(t))):
+        for i in np.flatnonzero(sign[1:] * sign[:-1] < 0):
+            found += [brentq(lambda t, k=k: gaps(np.array([t]))[k, 0], t[i], t[i + 1], xtol=1e-15)]
+    return found
 
 
-def _unloading(s: np.ndarray) -> dict[str, np.ndarray]:
-    return {"recovered_share": s, "stress_share": np.asarray(stress_ratio(jnp.asarray(s)))}
-
-
-def _refine(
-    columns: Callable[[np.ndarray], dict[str, np.ndarray]], tolerance: float, corners: np.ndarray | tuple[()] = ()
-) -> tuple[dict, float]:
-    """Columns at as few points as the tolerance allows, the first being the abscissa, and their error.
-
-    Points lie evenly from 0 to 1, and on the corners.
-    """
+def _refined(columns: Callable[[np.ndarray], Columns], tolerance: float, corners: list[float]) -> tuple[Columns, float]:
+    """Columns, the abscissa first, at as few even points and the corners as the tolerance allows; and their error."""
     count = MIN_ROWS
     while count <= MAX_ROWS:
         table = columns(np.union1d(np.linspace(0.0, 1.0, count + 1), corners))
@@ -161,7 +159,127 @@ def _refine(
         if error <= tolerance:
             return table, float(error)
         count *= 2
-    raise InputError(
-        f"{MAX_ROWS} points do not describe the curve to {tolerance:g}: it has a corner",
-        remedy="Export this law in another format",
-    )
+    problem = f"{MAX_ROWS} points do not describe the curve to {tolerance:g}: it has a corner"
+    raise InputError(problem, remedy="Export this law in another format")
+
+
+def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> Table:
+    """Paths of one particle between two platens with the law's force and tangent.
+
+    The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
+    every place where branches meet; the last unloads from small peaks; the others are random, by the seed.
+
+    Returns:
+        A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
+        tangent, the unit in the column's name. Every path starts from a virgin particle. Of a law with effects that are
+        no closed formula: path, time (a second from point to point), displacement and force.
+    """
+    check(law, particle)
+    seed, units = arguments.seed(seed), arguments.choice(units, get_args(Units), "units")
+    try:
+        side = half_contact(law, particle)
+    except InputError:  # no closed formula: point by point, as `mcc_jax.drive`
+        return _in_units(_driven(law, particle, seed), units)
+    rows = _contact_rows(side, None, seed)
+    rows[["displacement", "displacement_max"]] *= 2  # half of it at each platen
+    rows["tangent"] *= 0.5
+    return _in_units(rows, units)
+
+
+def golden_pair_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> Table:
+    """Paths of the overlap of two half contacts: with itself, with one of 0.6 times the size, and with a rigid wall.
+
+    Both sides carry one force; see `dem.pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
+    `wall`. Where the law is not monotone a pair has several answers, and the table holds one of them.
+    """
+    import pandas as pd
+
+    check(law, particle)
+    seed, units = arguments.seed(seed), arguments.choice(units, get_args(Units), "units")
+    smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
+    side = half_contact(law, particle)
+    partners = {"equal": side, "smaller": half_contact(law, smaller), "wall": None}
+    tables = [_contact_rows(side, other, seed).assign(partner=name) for name, other in partners.items()]
+    return _in_units(pd.concat(tables, ignore_index=True), units)
+
+
+def _contact_rows(side: HalfContact, other: HalfContact | None, seed: int) -> Table:
+    """Paths of the overlap of a pair, or with a rigid wall [um, mN]."""
+    import pandas as pd
+
+    scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
+
+    def recovered(peak: np.ndarray) -> np.ndarray:
+        return np.asarray(_recovered_overlap(side, other, jnp.atleast_1d(peak))).reshape(np.shape(peak))
+
+    paths = _paths(scale, recovered, seed)
+    number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+    x, past = np.concatenate(paths), np.concatenate([np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths])
+    force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
+    columns = {"path": number, "displacement": 1e6 * x, "displacement_max": 1e6 * past}
+    return pd.DataFrame(columns | {"force": 1e3 * force, "tangent": 1e-3 * tangent})
+
+
+def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
+    """Paths of a law whose effects have a memory, a second from point to point."""
+    import pandas as pd
+
+    scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
+
+    def recovered(peak: np.ndarray) -> np.ndarray:
+        return np.asarray(particle.displacement(law.recoverable_strain(particle, particle.strain(jnp.asarray(peak)))))
+
+    paths = _paths(scale, recovered, seed)
+    length = np.array([len(path) for path in paths])
+    number, second = np.nonzero(np.arange(length.max()) < length[:, None])
+    x = np.array([np.pad(path, (0, length.max() - len(path)), "edge") for path in paths])  # so it compiles once
+    along = eqx.filter_vmap(lambda x, time: law.path(particle, law.init(particle), x, time)[1], in_axes=(0, None))
+    force = np.asarray(eqx.filter_jit(along)(jnp.asarray(x), jnp.arange(float(length.max()))))
+    columns = {"path": number, "time_s": second, "displacement": x[number, second], "force": force[number, second]}
+    return pd.DataFrame(columns)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, 0))
+def _recovered_overlap(side: HalfContact, other: HalfContact | None, peak: Scalar) -> Scalar:
+    """Overlap recovered on full release [m]."""
+    return wall_recovery(side, peak) if other is None else pair_recovery(side, other, peak)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, 0, 0))
+def _contact(side: HalfContact, other: HalfContact | None, peak: Scalar, overlap: Scalar) -> tuple[Scalar, Scalar]:
+    """Force [N] and tangent [N/m] of a pair, or with a rigid wall."""
+
+    def force(overlap: Scalar) -> Scalar:
+        return wall_force(side, peak, overlap) if other is None else pair_force(side, other, peak, overlap)
+
+    return jax.value_and_grad(force)(overlap)
+
+
+def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:
+    """A path that meets every branch, some at random, one of small peaks; the largest displacement is `scale`."""
+    loading = np.linspace(0.0, 0.6 * scale, 13)
+    peak = loading[-1]
+    down = peak - recovered(np.asarray(peak)) * SHARES
+    further = np.linspace(peak, scale, 9)
+    end = scale - recovered(np.asarray(scale)) * SHARES
+    first = np.concatenate([[-0.01 * scale], loading, down, [-0.01 * scale], down[::-1], further, end, end[::-1]])
+    rng = np.random.default_rng(seed)
+    walks = []
+    for _ in range(RANDOM_PATHS):
+        peaks = np.maximum.accumulate(scale * rng.uniform(0.0, 1.0, STEPS) ** 2)
+        depth = np.where(rng.uniform(size=STEPS) < 0.5, 0.0, rng.uniform(0.0, 1.2, STEPS))
+        walks.append(peaks - depth * recovered(peaks))
+    small = scale * SMALL
+    turns = small[:, None] - recovered(small)[:, None] * np.concatenate([[0.0], SHARES])
+    return [first, *walks, turns.ravel()]
+
+
+def _in_units(table: Table, units: str) -> Table:
+    columns = {name: name for name in ("partner", "path", "time_s") if name in table}
+    for name in table.columns.difference(list(columns), sort=False):
+        ours, si, factor = SI[name.removesuffix("_max")]
+        columns[name] = f"{name}_{si if units == 'SI' else ours}"
+        table[name] *= factor if units == "SI" else 1.0
+    return table.reindex(columns=list(columns)).rename(columns=columns)
