@@ -4,7 +4,6 @@ import numpy as np
 
 from mcc_jax import MccLaw, Particle
 
-Numbers = np.ndarray | float
 HALVINGS = 1100  # down to the smallest floating-point number
 
 
@@ -42,32 +41,11 @@ class _Half:
         return np.where(d > 0, np.minimum(self.diameter * np.sqrt(square) / 2, limit), 0.0)
 
 
-def pair_force(
-    law_i: MccLaw,
-    particle_i: Particle,
-    law_j: MccLaw,
-    particle_j: Particle | None,
-    overlap: Numbers,
-    overlap_max: Numbers,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    r"""Force, tangent and recoverable overlap of two half contacts in series.
+def pair_force(law_i, particle_i, law_j, particle_j, overlap, overlap_max):
+    """Force [mN], its derivative [mN/um] (that of loading at the peak) and recoverable overlap [um] of a pair.
 
-    Each side is half a platen test, :math:`F_s(d) = F_{plates}(2d)`. On loading the overlap is shared so that both
-    carry one force, :math:`d_i + d_j = \delta, F_i(d_i) = F_j(d_j)`. Both unload along one curve of
-    :math:`\sigma/\sigma_P`, so that
-
-    .. math:: F = F_P g(q), \quad q = (\delta_P - \delta)/W, \quad W = W_i + W_j
-
-    Args:
-        law_i: law of one particle; monotone, or the share is not unique.
-        particle_i: its size; D3 along the contact's normal.
-        law_j: law of the other.
-        particle_j: its size; None for a rigid wall.
-        overlap: overlap now [um], one or many.
-        overlap_max: the largest so far [um], not below `overlap`.
-
-    Returns:
-        Force [mN], dF/d overlap [mN/um] (that of loading at the peak), and W [um].
+    Each side is half a platen test; on loading the overlap is shared so that both carry one force, and both unload
+    along one curve of stress over peak stress. Laws are monotone; without a `particle_j` the other side is a rigid wall.
     """
     i = _Half(law_i, particle_i)
     j = None if particle_j is None else _Half(law_j, particle_j)

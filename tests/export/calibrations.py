@@ -3,11 +3,11 @@
 import json
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
 from mcc_jax import load
-from mcc_jax.calibrate.estimates import law_of
 from mcc_jax.calibrate.results import Calibration
 
 SIZES = {"A": (200, 190, 160), "b c": (150, 140, 130), "falling": (150, 140, 130), "out": (100, 90, 80)}
@@ -56,13 +56,10 @@ def content(**changes):
     } | changes
 
 
-def write(folder, sizes=True, **changes):
-    """A folder with that calibration and, if wanted, the campaign's sizes; returns it."""
+def write(folder, **changes):
+    """A folder with that calibration; returns it."""
     folder.mkdir(exist_ok=True)
     (folder / "calibration.json").write_text(json.dumps(content(**changes)))
-    if sizes:
-        rows = ("particle,D1_um,D2_um,D3_um", *(f"{name},{D1},{D2},{D3}" for name, (D1, D2, D3) in SIZES.items()))
-        (folder / "particles.csv").write_text("\n".join(rows) + "\n")
     return folder
 
 
@@ -71,10 +68,7 @@ class Numbers(Calibration):
     """Stands in for a saved calibration: what `write` wrote."""
 
     content: dict
-    campaign = None
-
-    def law(self, particle=None):
-        return law_of(self.content, particle, None if particle is None else np.array(SIZES[particle], float))
+    campaign = SimpleNamespace(particles=tuple(SIZES), diameters_um=np.array(list(SIZES.values()), float))
 
 
 def stand_in(folder):

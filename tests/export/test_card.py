@@ -4,13 +4,12 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import pytest
-from calibrations import write
+from calibrations import estimate, write
+from compiling import PARTICLE
 
-from mcc_jax import InputError, Particle, Unloading, paper_law
+from mcc_jax import Unloading, paper_law
 from mcc_jax.export import card, read_calibration
 from mcc_jax.law import StrainScaling
-
-PARTICLE = Particle(213.54, 196.07, 186.33)
 
 
 @pytest.mark.parametrize("unloading", Unloading)
@@ -60,41 +59,20 @@ def test_population_has_the_medians_and_their_uncertainty(tmp_path):
     assert written["population"]["log_C1"]["sd"]["value"] == 0.3
     assert written["law"]["unloading"] == "punch"
     assert written["provenance"]["calibration"]["method"] == "bayes"
-    assert written["particle"]["D1_um"] == 150.0  # the mean of the table
+    assert written["particle"]["D1_um"] == 150.0  # the mean of the campaign
+    assert origin.geometry == "mean diameters of the 4 particles of the calibrated campaign"
     assert written["warnings"] == []
 
 
 def test_a_particle_has_its_own_coefficients_and_size(tmp_path):
-    law, particle, origin = read_calibration(write(tmp_path / "fit"), particle="b c")
+    """And where shapes scatter its own shape factor."""
+    folder = write(tmp_path / "fit", shape_scatter=estimate(0.1))
+    law, particle, origin = read_calibration(folder, particle="b c")
     assert [float(v) for v in (law.plastic.C1, law.plastic.C3, law.plastic.C5)] == [9.0, 3.1, 2.5]
     assert float(particle.D3) == 130.0
-    assert card(law, particle, origin=origin)["coefficients_of"] == "b c"
-
-
-def test_where_shapes_scatter_a_particle_has_its_own_shape_factor(tmp_path):
-    folder = write(tmp_path / "fit", shape_scatter={"value": 0.1, "sd": None, "interval_95": None})
-    law, particle, _ = read_calibration(folder, particle="A")
     assert float(law.shape_factor(particle)) == pytest.approx(1.3, rel=1e-12)
-    law, *_ = read_calibration(folder)
-    assert float(law.a) == 1.4
-
-
-def test_without_sizes_the_population_is_shown_on_a_sphere_and_says_so(tmp_path):
-    _, particle, origin = read_calibration(write(tmp_path / "fit", sizes=False))
-    assert [float(d) for d in (particle.D1, particle.D2, particle.D3)] == [200.0] * 3
-    assert "sphere" in origin.geometry
-
-
-def test_a_falling_curve_is_refused_or_flagged(tmp_path):
-    folder = write(tmp_path / "fit")
-    with pytest.raises(InputError, match="not monotone"):
-        read_calibration(folder, particle="falling")
-    law, particle, origin = read_calibration(folder, particle="falling", allow_not_monotone=True)
     written = card(law, particle, origin=origin)
-    assert written["is_monotone"] is False
-    assert "not monotone" in written["warnings"][0]
-
-
-def test_what_did_not_converge_is_flagged(tmp_path):
-    _, _, origin = read_calibration(write(tmp_path / "fit", converged=False, warnings=["few particles"]))
-    assert origin.warnings == ("the calibration of calibration.json did not converge", "few particles")
+    assert written["coefficients_of"] == "b c"
+    assert written["parameters"]["C1"] == {**estimate(9.0, 0.1), "unit": "1"}
+    assert written["parameters"]["a"]["sd"] is None
+    assert float(read_calibration(folder)[0].a) == 1.4

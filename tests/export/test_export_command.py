@@ -51,17 +51,14 @@ def test_the_header_passes_its_own_golden_tables(run, tmp_path):
     law, particle, _ = read_calibration(folder, particle="b c")
     size = np.array([[float(d) for d in (particle.D1, particle.D2, particle.D3)]])
     single, pair = golden(out / "mcc_law_golden.csv"), golden(out / "mcc_law_pair_golden.csv")
-    cases = [(PLATES, single, size)]
-    cases += [
-        (kind, pair[pair["partner"] == name], other)
-        for name, kind, other in (("equal", PAIR, size), ("smaller", PAIR, 0.6 * size), ("wall", WALL, size))
-    ]
-    for kind, table, other in cases:
+    partners = (("equal", PAIR, size), ("smaller", PAIR, 0.6 * size), ("wall", WALL, size))
+    cases = [(kind, pair[pair["partner"] == name], other) for name, kind, other in partners]
+    for kind, table, other in [(PLATES, single, size), *cases]:
         assert len(np.unique(table["path"])) == 10  # the last one of small peaks, where the recovery is limited
         for number in np.unique(table["path"]):
             rows = table[table["path"] == number]
             x = rows["displacement_m"][None]
-            force, tangent, peak = run_driver(program, head(kind, x.shape[1], law, size, law, other), x)
+            force, tangent, peak = run_driver(program, head(kind, x.shape[1], law, size, other), x)
             assert np.abs(force[0] - rows["force_N"]).max() <= 1e-12 * table["force_N"].max()
             assert np.abs(tangent[0] - rows["tangent_N_per_m"]).max() <= 1e-9 * table["tangent_N_per_m"].max()
             np.testing.assert_allclose(peak[0], rows["displacement_max_m"], rtol=1e-15)
@@ -75,30 +72,32 @@ def test_options_arrive(run, tmp_path):
     assert written["coefficients_of"] == "A"
     assert written["particle"]["D2_um"] == 110.0
     first = (out / "parameters_golden.csv").read_text()
-    assert run("export", *arguments, "--diameters", folder / "particles.csv", "--particle", "A").exit_code == 0
-    written = json.loads((out / "parameters.json").read_text())
-    assert written["particle"]["D2_um"] == 190.0
+    table = tmp_path / "particles.csv"
+    table.write_text("particle,D1_um,D2_um,D3_um\nA,200,190,160\n")
+    assert run("export", *arguments, "--diameters", table, "--particle", "A").exit_code == 0
+    written = json.loads((out / "parameters.json").read_text())["particle"]
+    assert (written["D2_um"], written["from"]) == (190.0, "particle A of particles.csv")
+    assert run("export", *arguments, "--diameters", table, "--particle", "b c").exit_code == 2
     assert (out / "parameters_golden.csv").read_text() != first
 
 
-def test_what_is_not_monotone_is_exported_only_on_demand_and_said(run, tmp_path):
-    folder, out = write(tmp_path / "fit"), tmp_path / "out"
-    arguments = (folder, "--format", "c", "--out", out, "--particle", "falling")
-    assert "--allow-not-monotone" in refused(run("export", *arguments))
+def test_what_is_not_monotone_or_did_not_converge_is_exported_and_said(run, tmp_path):
+    folder, out = write(tmp_path / "fit", converged=False, warnings=["the chains disagree"]), tmp_path / "out"
+    arguments = (folder, "--out", out, "--particle", "falling", "--format")
+    assert "--allow-not-monotone" in refused(run("export", *arguments, "c"))
     assert not out.exists()
-    result = run("export", *arguments, "--allow-not-monotone")
-    assert result.exit_code == 0
-    assert "Warning: The loading curve is not monotone" in result.stdout
-    assert "WARNING" in (out / "mcc_law.h").read_text()
-
-
-def test_what_did_not_converge_is_exported_and_said(run, tmp_path):
-    folder = write(tmp_path / "fit", converged=False, warnings=["the chains disagree"])
-    result = run("export", folder, "--format", "c", "--out", tmp_path / "out")
-    assert result.exit_code == 0
-    assert "Warning: The calibration of calibration.json did not converge." in result.stdout
-    assert "Warning: The chains disagree." in result.stdout
-    assert "did not converge" in (tmp_path / "out" / "mcc_law.h").read_text()
+    for form in ("c", "json"):
+        result = run("export", *arguments, form, "--allow-not-monotone")
+        assert result.exit_code == 0
+        assert "Warning: The calibration of calibration.json did not converge." in result.stdout
+        assert "Warning: The chains disagree." in result.stdout
+        assert "Warning: The loading curve is not monotone" in result.stdout
+    header = (out / "mcc_law.h").read_text()
+    assert "WARNING: the loading curve is not monotone" in header
+    assert "WARNING: that calibration did not converge" in header
+    written = json.loads((out / "parameters.json").read_text())
+    assert written["is_monotone"] is False
+    assert "not monotone" in written["warnings"][-1]
 
 
 def changed(**changes):
@@ -115,12 +114,6 @@ BAD = {
     "steep shape": (changed(a=estimate(-20.0)), (), "the shape factor"),
     "unknown particle": (None, ("--particle", "Z"), "There are: A, b c, falling, out"),
     "particle left out": (None, ("--particle", "out"), "took no part in the calibration: burst at 3 mN"),
-    "particle without size": (lambda f: (f / "particles.csv").unlink(), ("--particle", "A"), "--diameters"),
-    "particle not in table": (
-        lambda f: (f / "particles.csv").write_text("particle,D1_um,D2_um,D3_um\nB,1,1,1\n"),
-        ("--particle", "A"),
-        "particles.csv: there is no particle 'A'",
-    ),
     "two diameters": (None, ("--diameters", "1,2"), "1,2: there is no such file"),
     "zero diameter": (None, ("--diameters", "1,0,2"), "--diameters"),
     "empty diameters": (None, ("--diameters", " "), "--diameters"),
@@ -146,15 +139,6 @@ def test_bad_input_is_one_line_and_writes_nothing(run, tmp_path, kind):
 def test_format_is_required_and_checked(run, tmp_path):
     assert "--format" in refused(run("export", write(tmp_path / "fit"), "--out", tmp_path / "out"))
     assert "'matlab'" in refused(run("export", tmp_path / "fit", "--format", "matlab", "--out", tmp_path / "out"))
-
-
-def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
-    folder = write(tmp_path / "fit")
-    (folder / "campaign").mkdir()
-    (folder / "particles.csv").rename(folder / "campaign" / "particles.csv")
-    _, particle, origin = read_calibration(folder, particle="A")
-    assert float(particle.D1) == 200.0
-    assert origin.geometry == "particle A of particles.csv"
 
 
 @pytest.mark.extended

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bisecting import pair_force as bisected
-from test_c_header import MODULUS_MPA
+from compiling import MODULUS_MPA, PARTICLE
 
 from mcc_jax import MccLaw, Particle, Plastic, Unloading
 from mcc_jax.dem import half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from mcc_jax.export import golden_pair_table
 from mcc_jax.law import StrainScaling
 
-ONE = Particle(213.54, 196.07, 186.33)
+ONE = PARTICLE
 OTHER = Particle(90.0, 120.0, 100.0)
 
 

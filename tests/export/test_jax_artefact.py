@@ -1,3 +1,6 @@
+"""JAX artefacts where mcc_jax cannot be imported, with and without the memory of effects."""
+
+import itertools
 import json
 import os
 import subprocess
@@ -7,29 +10,46 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import PARTICLE
 
-from mcc_jax import InputError, Particle, Unloading, paper_law
+from mcc_jax import InputError, Unloading, drive, paper_law
 from mcc_jax.export import golden_table, jax_artefact, write_export
 from mcc_jax.law import StrainScaling
 
 pytestmark = pytest.mark.extended
 
-PARTICLE = Particle(213.54, 196.07, 186.33)
+FORMS = [(Unloading.PRINTED, StrainScaling.RAW), (Unloading.PUNCH, StrainScaling.MASTER)]
+SIZES = [float(v) for v in (PARTICLE.D1, PARTICLE.D2, PARTICLE.D3)]
 
-# Runs where mcc_jax cannot be imported: JAX, NumPy and the files are all there is.
-CONSUMER = """
+
+def coefficients(law):
+    return [float(v) for v in (law.plastic.C1, law.plastic.C3, law.plastic.C5)]
+
+
+def run_alone(folder, code, *arguments):
+    """What a script prints that has JAX, NumPy and the exported files, and nothing else."""
+    start = """
 import json, sys
 from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
 folder = Path(sys.argv[1])
-table = np.genfromtxt(folder / "mcc_jax_export_golden.csv", delimiter=",", names=True)
-found = {}
-largest, stiffest = table["force_mN"].max(), table["tangent_mN_per_um"].max()
-reloading = table["displacement_um"] < table["displacement_max_um"]
 
 def load(which, dtype):
     return jax.export.deserialize(bytearray((folder / f"mcc_{which}_{dtype}.jax_export").read_bytes()))
+"""
+    end = '\nassert not [name for name in sys.modules if name.startswith(("mcc_jax", "equinox"))]\n'
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run([sys.executable, "-c", start + code + end, folder, *map(json.dumps, arguments)],
+                          capture_output=True, text=True, timeout=240, env=environment, cwd=folder)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+GOLDEN = """
+table = np.genfromtxt(folder / "mcc_jax_export_golden.csv", delimiter=",", names=True)
+found = {}
+reloading = table["displacement_um"] < table["displacement_max_um"]
 
 def arguments(dtype):
     x = jnp.asarray(table["displacement_um"], dtype)
@@ -54,14 +74,10 @@ force, tangent, _ = load("step", "float64").call(x, past)
 found["one of many"] = float(load("step", "float64").call(x[10:11], past[10:11])[0][0] - force[10])
 only, each = load("force", "float64"), load("step_each", "float64")
 slope = jax.grad(lambda x: only.call(x, past).sum())(x)
-found["gradient"] = float(jnp.abs(slope - tangent).max() / stiffest)
+found["gradient"] = float(jnp.abs(slope - tangent).max() / table["tangent_mN_per_um"].max())
 found["sensitivity"] = jax.grad(lambda own: each.call(x, past, sizes, own)[0].sum())(own).sum(0).tolist()
-assert not [name for name in sys.modules if name.startswith(("mcc_jax", "equinox"))]
 print(json.dumps(found))
 """
-
-
-FORMS = [(Unloading.PRINTED, StrainScaling.RAW), (Unloading.PUNCH, StrainScaling.MASTER)]
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
@@ -75,15 +91,7 @@ def test_a_fresh_process_with_jax_alone_gets_the_golden_table(tmp_path, form):
         for which in ("force", "step", "step_each")
         for dtype in ("float64", "float32")
     }
-    coefficients = [float(v) for v in (law.plastic.C1, law.plastic.C3, law.plastic.C5)]
-    diameters = [float(v) for v in (PARTICLE.D1, PARTICLE.D2, PARTICLE.D3)]
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
-        [sys.executable, "-c", CONSUMER, tmp_path, json.dumps(diameters), json.dumps(coefficients)],
-        capture_output=True, text=True, timeout=120, env=environment, cwd=tmp_path,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    found = json.loads(run_alone(tmp_path, GOLDEN, SIZES, coefficients(law)))
     double, single = found["float64"], found["float32"]
     assert double["platforms"] == ["cpu", "cuda", "rocm", "tpu"]
     for function in ("force", "step", "step_each"):
@@ -109,16 +117,67 @@ def sensitivity(law):
         history = type(law.init(PARTICLE))
         return jax.vmap(lambda x, past: law.step(PARTICLE, history(past), x)[1])(x, past).sum()
 
-    plastic = jax.grad(total)(law).plastic
-    return [float(v) for v in (plastic.C1, plastic.C3, plastic.C5)]
+    return coefficients(jax.grad(total)(law))
 
 
-def test_platforms_are_those_asked_for():
+MEMORY = """
+files = json.loads((folder / "mcc_jax_export.json").read_text())["artefacts"]["files"]
+given = np.load(folder / "given.npz")
+
+def run(which, first, *more):
+    call, signature = load(which, "float64").call, files[f"mcc_{which}_float64.jax_export"]
+    memory = [jnp.broadcast_to(jnp.asarray(m["start"], m["dtype"]), (2, *m["shape"])) for m in signature["memory"]]
+    count = len(signature["results"]) - 1
+    def step(memory, now):
+        *results, = call(jnp.repeat(now[0], 2), jnp.repeat(now[1], 2), *more, *memory)
+        return results[count:], results[0]
+    memory, answer = jax.lax.scan(step, memory, (jnp.asarray(first), jnp.asarray(given["time"])))
+    slope = jax.grad(lambda x: call(x, jnp.ones(2), *more, *memory)[0].sum())(jnp.full(2, first[-1]))
+    after = {f"m{k}": np.asarray(m[1]) for k, m in enumerate(memory)}
+    np.savez(folder / f"{which}.npz", answer=np.asarray(answer[:, 1]), slope=np.asarray(slope[1]), **after)
+
+run("step", given["displacement"])
+run("step_load", given["force"])
+run("step_each", given["displacement"], *(np.tile(json.loads(text), (2, 1)) for text in sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize("more", [(), ("thermal_drift", "damage:cyclic", "size_effect")], ids=["two", "five"])
+def test_a_fresh_process_with_jax_alone_follows_memory_and_time(more, tmp_path):
+    """Creep, frame, a drift, cyclic damage: as `mcc_jax.drive` to 1e-12, memory included."""
+    law = paper_law().with_effects("creep:logarithmic", "frame_compliance", *more)
+    turns = [0.0, 40.0, 37.0, 60.0, 58.0, 58.5]
+    x = np.concatenate([np.linspace(a, b, 9) for a, b in itertools.pairwise(turns)])
+    time = np.cumsum(np.random.default_rng(0).uniform(0.1, 5.0, len(x)))
+    by_displacement = drive(law, PARTICLE, x, time=time)
+    force = np.array(by_displacement.force)
+    by_load = drive(law, PARTICLE, force, time=time, control="load")
+    assert "mcc_force_float64.jax_export" not in write_export("jax", law, PARTICLE, tmp_path)
+    np.savez(tmp_path / "given.npz", displacement=x, force=force, time=time)
+    run_alone(tmp_path, MEMORY, SIZES, coefficients(law))
+    for which, want, state in (
+        ("step", force, by_displacement.state),
+        ("step_each", force, by_displacement.state),
+        ("step_load", by_load.displacement, by_load.state),
+    ):
+        written = np.load(tmp_path / f"{which}.npz")
+        np.testing.assert_allclose(written["answer"], want, rtol=0, atol=1e-12 * np.abs(want).max())
+        leaves = jax.tree.leaves(state)
+        assert len(leaves) == sum(name.startswith("m") for name in written.files)
+        for k, leaf in enumerate(leaves):
+            np.testing.assert_allclose(written[f"m{k}"], leaf, rtol=1e-12, atol=1e-12)
+        assert np.isfinite(written["slope"])
+    table = np.genfromtxt(tmp_path / "mcc_jax_export_golden.csv", delimiter=",", names=True)
+    path = table[table["path"] == 1]
+    again = drive(law, PARTICLE, path["displacement_um"], time=path["time_s"])
+    np.testing.assert_allclose(path["force_mN"], again.force, rtol=0, atol=1e-12 * float(again.force.max()))
+
+
+def test_what_an_artefact_cannot_be_is_refused():
     artefact = jax_artefact(paper_law(), PARTICLE, "force", platforms=("cpu",))
     assert artefact.signature["platforms"] == ["cpu"]
     assert jax.export.deserialize(bytearray(artefact.content)).platforms == ("cpu",)
-
-
-def test_double_precision_out_of_single_is_refused():
     with jax.enable_x64(False), pytest.raises(InputError, match="single precision"):
         jax_artefact(paper_law(), PARTICLE)
+    with pytest.raises(InputError, match="Choices: step_load, step, step_each"):
+        jax_artefact(paper_law().with_effects("creep"), PARTICLE, "force")

@@ -1,16 +1,14 @@
 import re
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
-from compiling import HERE, compile_with
+from compiling import HERE, PARTICLE, compile_with
 
-from mcc_jax import Particle, Unloading, paper_law
+from mcc_jax import Unloading, paper_law
 from mcc_jax.export import Origin, c_header, lammps_recipe, yade_recipe
 from mcc_jax.law import StrainScaling
 
-PARTICLE = Particle(213.54, 196.07, 186.33)
 FORMS = [(Unloading.PRINTED, StrainScaling.RAW), (Unloading.PUNCH_EXACT, StrainScaling.MASTER)]
 
 
@@ -79,10 +77,3 @@ def test_recipes_carry_values_provenance_and_what_was_not_tested(recipe):
 def test_python_of_the_yade_recipe_is_python():
     (block,) = re.findall(r"```python\n(.*?)```", yade_recipe(paper_law(), PARTICLE), flags=re.DOTALL)
     compile(block, "yade.md", "exec")
-
-
-def test_template_files_are_next_to_the_code():
-    from mcc_jax import export
-
-    folder = Path(export.__file__).parent / "templates"
-    assert {p.name for p in folder.iterdir()} == {"mcc_law.h.j2", "lammps.md.j2", "yade.md.j2"}
