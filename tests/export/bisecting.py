@@ -45,7 +45,7 @@ def pair_force(law_i, particle_i, law_j, particle_j, overlap, overlap_max):
     """Force [mN], its derivative [mN/um] (that of loading at the peak) and recoverable overlap [um] of a pair.
 
     Each side is half a platen test; on loading the overlap is shared so that both carry one force, and both unload
-    along one curve of stress over peak stress. Laws are monotone; without a `particle_j` the other side is a rigid wall.
+    along one curve of stress over peak stress. Laws are monotone; no `particle_j` is a rigid wall.
     """
     i = _Half(law_i, particle_i)
     j = None if particle_j is None else _Half(law_j, particle_j)
