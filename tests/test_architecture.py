@@ -1,6 +1,7 @@
 """Layers import downwards only; what is public is re-exported by name; importing does nothing else."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -55,35 +56,30 @@ def module_name(file):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {module_name(f): f for f in FILES}
+MODULES = {module_name(f): f for f in sorted(PACKAGE.rglob("*.py"))}
+PACKAGES = sorted(n for n, f in MODULES.items() if f.name == "__init__.py")
 
 
-def resolve(name):
+def resolve(parts):
     """The module that holds a dotted name: the longest prefix that is a module."""
-    parts = name.split(".") if name else []
     while parts and ".".join(parts) not in MODULES:
-        parts.pop()
+        parts = parts[:-1]
     return ".".join(parts)
 
 
-def imports(file):
-    """Modules of mcc_jax that a file imports, at the top or inside functions, relative or absolute."""
-    parts = file.relative_to(PACKAGE).parts[:-1]
+def imports(name):
+    """Modules of mcc_jax that one of them imports, at the top or inside functions, relative or absolute."""
+    file = MODULES[name]
+    here = ["mcc_jax", *file.relative_to(PACKAGE).parts[:-1]]
+    found = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                if alias.name.split(".")[0] == "mcc_jax":
-                    yield resolve(".".join(alias.name.split(".")[1:]))
-        elif isinstance(node, ast.ImportFrom):
-            if node.level:
-                base = [*parts[: len(parts) - node.level + 1], *(node.module or "").split(".")]
-            elif (node.module or "").split(".")[0] == "mcc_jax":
-                base = node.module.split(".")[1:]
-            else:
-                continue
-            base = [b for b in base if b]
-            for alias in node.names:
-                yield resolve(".".join([*base, alias.name]))
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            start = here[: len(here) - node.level + 1] if node.level else []
+            module = ".".join([*start, *([node.module] if node.module else [])])
+            names = [f"{module}.{alias.name}" for alias in node.names]
+        found |= {resolve(one.split(".")[1:]) for one in names if one.split(".")[0] == "mcc_jax"}
+    return found
 
 
 def group(module):
@@ -96,46 +92,25 @@ def layer(module):
     return LAYERS[group(module)]
 
 
-def test_there_is_something_to_check():
-    assert {"geometry", "law.mcc", "formulas.recovery", "_numerics"} <= set(MODULES)
-    assert "law.response" in set(imports(MODULES["law.mcc"]))
-    assert "geometry" in set(imports(MODULES["law.mcc"]))
-
-
 def test_every_top_level_module_has_its_layer():
     unknown = {(name or "__init__").split(".")[0] for name in MODULES} - set(LAYERS)
     assert not unknown, f"give {sorted(unknown)} a layer in tests/test_architecture.py"
+    assert {"law.response", "geometry"} <= imports("law.mcc")
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_imports_point_downwards(name):
-    for target in set(imports(MODULES[name])):
+    for target in imports(name):
         if group(target) == group(name):
             continue
-        assert target or layer(name) == LAYERS["__init__"], (
-            f"{name} imports the top of mcc_jax, which imports everything"
-        )
+        assert target or layer(name) == LAYERS["__init__"], f"{name} imports the top, which imports everything"
         leaf = layer(name) == layer(target) == LEAF
         assert layer(target) < layer(name) or leaf, f"{name} imports {target}, of a later layer"
 
 
 def test_no_cycles():
-    graph = {name: {t for t in imports(file) if t != name} for name, file in MODULES.items()}
-    # A package's __init__ gathers its own files; a file that imports a sibling through it would close a circle.
-    done, active = set(), []
-
-    def visit(name):
-        if name in done:
-            return
-        assert name not in active, " -> ".join([*active[active.index(name) :], name])
-        active.append(name)
-        for target in sorted(graph[name]):
-            visit(target)
-        active.pop()
-        done.add(name)
-
-    for name in graph:
-        visit(name)
+    """A package's __init__ gathers its own files; a file that imports a sibling through it would close a circle."""
+    graphlib.TopologicalSorter({name: imports(name) - {name} for name in MODULES}).prepare()
 
 
 def public(name):
@@ -156,16 +131,12 @@ def test_the_top_of_the_package_loads_lazily_and_holds_every_name_of_its_stub():
     assert names == sorted(a.name for node in public("").body if isinstance(node, ast.ImportFrom) for a in node.names)
 
 
-@pytest.mark.parametrize("name", sorted(n for n, f in MODULES.items() if f.name == "__init__.py"))
+@pytest.mark.parametrize("name", PACKAGES)
 def test_public_names_are_re_exported_one_by_one(name):
     """`from .x import y as y`, besides a docstring: no star, no definitions, nothing that runs on import."""
-    body = public(name).body
-    if name:
-        assert ast.get_docstring(public(name))
-        body = body[1:]
-    for node in body:
-        if isinstance(node, ast.ImportFrom) and node.module == "__future__":
-            continue
+    tree, exported = public(name), []
+    assert ast.get_docstring(tree) or not name
+    for node in tree.body[1:] if name else tree.body:
         if not name and isinstance(node, ast.AnnAssign):
             assert ast.unparse(node.target) == "__version__"
             continue
@@ -173,13 +144,8 @@ def test_public_names_are_re_exported_one_by_one(name):
         assert node.level in (1, 2)  # what a package below has may be offered by name, too
         for alias in node.names:
             assert alias.asname == alias.name, f"mcc_jax.{name}: write `import {alias.name} as {alias.name}`"
-
-
-@pytest.mark.parametrize("name", sorted(n for n, f in MODULES.items() if f.name == "__init__.py"))
-def test_private_names_stay_private(name):
-    tree = public(name)
-    exported = [a.name for node in tree.body if isinstance(node, ast.ImportFrom) for a in node.names]
-    assert not [e for e in exported if e.startswith("_") and e != "__future__"]
+            assert not alias.name.startswith("_")
+            exported.append(alias.name)
     assert len(set(exported)) == len(exported)
 
 

@@ -71,33 +71,14 @@ def test_definitions_as_the_paper_words_them():
     assert plastic_shape_factor(p, -0.85) < 1 < plastic_shape_factor(p, 0.1)
 
 
-def test_the_paper_calls_D1_major_although_it_is_often_the_smaller(particles):
-    smaller = np.flatnonzero(particles.D1 < particles.D2) + 1
-    assert list(smaller) == [2, 3, 4, 5, 7, 8, 11, 12, 13, 17, 19, 20]
-    assert list(np.flatnonzero(np.minimum(particles.D1, particles.D2) < particles.D3) + 1) == [12, 17, 20]
-
-
-def test_effective_and_mean_diameter_are_not_proportional(particles):
+def test_effective_and_mean_diameter_of_the_papers_particles(particles):
     effective, *_, mean = eqx.filter_vmap(sizes_and_shapes, in_axes=(0, None))(particles, A)
     effective, mean = np.asarray(effective), np.asarray(mean)
     check(np.mean(mean / effective), "0.77864")
-    check(np.std(mean / effective, ddof=1), "0.1164")
     check(np.min(mean / effective), "0.548")
     check(np.max(mean / effective), "0.989")
-    check(np.mean(effective / mean), "1.31315")
-    check(np.std(effective / mean, ddof=1), "0.2064")
-    check(np.min(effective / mean), "1.011")
-    check(np.max(effective / mean), "1.825")
-    check(effective @ mean / (mean @ mean), "1.25555")
-    check(np.corrcoef(effective, mean)[0, 1], "0.8928")
     check(mean.min(), "74.4")
     check(mean.max(), "261.3")
-
-
-def test_effective_diameter_exceeds_every_diameter_of_a_flat_particle():
-    p = paper_particle(6)
-    check(p.effective_diameter, "135.7")
-    assert max(p.D1, p.D2, p.D3) == 93.8
 
 
 def test_printed_elastic_shape_factor_is_no_number_when_D1_is_the_smaller(particles):

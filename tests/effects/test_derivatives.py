@@ -8,28 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import with_dtype
-from tested import FORCE, LAW, NAMES, PARTICLE, RECORD, START, VARIANTS, lanes, respond, signature_rows, single
+from tested import BASE, FORCE, LAW, NAMES, PARTICLE, RECORD, START, VARIANTS, lanes, respond, signature_rows
 
 from mcc_jax.effects import LIBRARY
 
 EVERY = pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 
 
-@functools.cache
-def base_response():
-    return np.asarray(LAW.path_load(PARTICLE, LAW.init(PARTICLE), FORCE)[1])
-
-
 @EVERY
-def test_null_is_the_base_law(variant):
-    np.testing.assert_allclose(lanes(variant)[0][0], base_response(), rtol=1e-12)
-
-
-@EVERY
-def test_values_and_derivatives_are_finite(variant):
+def test_null_is_the_base_law_and_the_law_of_a_fit_gives_the_same(variant):
     values, slopes = lanes(variant)
     assert np.isfinite(values).all()
     assert np.isfinite(slopes).all()
+    np.testing.assert_allclose(values[0], BASE, rtol=1e-12)
+    np.testing.assert_allclose(values[6], values[4], rtol=1e-9, atol=1e-9)
 
 
 @EVERY
@@ -46,12 +38,6 @@ def test_derivative_by_the_amplitude(variant):
     np.testing.assert_allclose(one_sided[smooth], slopes[0][smooth], atol=3e-5 * scales[0], rtol=0)
     np.testing.assert_allclose(central, slopes[4], atol=3e-5 * scales[1], rtol=0)
     np.testing.assert_array_equal(slopes[0][~smooth], 0)
-
-
-@EVERY
-def test_the_law_of_a_fit_gives_the_same(variant):
-    values, _ = lanes(variant)
-    np.testing.assert_allclose(values[6], values[4], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.extended
@@ -121,7 +107,7 @@ SOME = [v for v in VARIANTS if v.name in ("kelvin_voigt", "jkr", "siebel", "heck
 @pytest.mark.extended
 def test_single_precision():
     """At the null every variant is the base law in float32, too; at the typical amplitude close to float64."""
-    law, particle, record = (single(t) for t in (LAW, PARTICLE, RECORD))
+    law, particle, record = (with_dtype(t, jnp.float32) for t in (LAW, PARTICLE, RECORD))
     base = law.path_load(particle, law.init(particle), record.force)[1]
     for variant in SOME:
         run = jax.jit(functools.partial(respond, variant, law=law, particle=particle, record=record))

@@ -5,10 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import paper_particle
-from tested import FORCE, HUMIDITY, LAW, PARTICLE, RECORD, TIME, VARIANTS
+from tested import BASE, FORCE, HUMIDITY, LAW, PARTICLE, RECORD, TIME, VARIANTS
 
-from mcc_jax.effects import LIBRARY, Record, clean_record
+from mcc_jax.effects import LIBRARY
 
 ADDITIVE = ("creep", "adhesion", "reload_hysteresis", "ratcheting", "unloading_shape", "pop_in", "toe_asperity")
 OBSERVED = ("frame_compliance", "thermal_drift", "platen_sink_in", "misalignment", "reverse_plasticity")
@@ -44,7 +43,7 @@ def by_steps(law, force, time, particle=PARTICLE):
 def test_closed_form_is_the_scan():
     for law in (EVERYTHING, MEMORIES):
         (state, path), (state_by_steps, steps) = along(law, FORCE, TIME), by_steps(law, FORCE, TIME)
-        assert jnp.max(jnp.abs(path - LAW.path_load(PARTICLE, LAW.init(PARTICLE), FORCE)[1])) > 0.5
+        assert jnp.max(jnp.abs(path - BASE)) > 0.5
         np.testing.assert_allclose(path, steps, rtol=1e-10, atol=1e-10)
         for one, other in zip(jax.tree.leaves(state), jax.tree.leaves(state_by_steps), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
@@ -82,21 +81,6 @@ def test_padding_changes_nothing():
     whole, longer = run(PARTICLE, RECORD), run(PARTICLE, padded)
     np.testing.assert_allclose(longer[: FORCE.size], whole, rtol=1e-13)
     np.testing.assert_allclose(longer[FORCE.size :], np.full(7, whole[-1]), rtol=1e-13)
-
-
-@pytest.mark.extended
-def test_batch_is_the_loop():
-    law = law_with("creep", "rate_dependence", "damage", first_only=True)
-    particles = [paper_particle(n) for n in (1, 6, 12)]
-    factors = jnp.asarray([1.0, 0.4, 1.3])
-
-    def one(particle, factor):
-        return law.respond(particle, clean_record(factor * FORCE, TIME / factor))
-
-    batch = eqx.filter_jit(eqx.filter_vmap(one))(jax.tree.map(lambda *x: jnp.stack(x), *particles), factors)
-    single = eqx.filter_jit(one)
-    for i, particle in enumerate(particles):
-        np.testing.assert_allclose(batch[i], single(particle, factors[i]), rtol=1e-11)
 
 
 @pytest.mark.extended
@@ -164,8 +148,7 @@ def test_two_effects_that_only_add_are_their_sum():
     names = ("frame_compliance", "toe_asperity")
     parts = [law_with(n, first_only=True).respond(PARTICLE, RECORD) for n in names]
     both = law_with(*names, first_only=True).respond(PARTICLE, RECORD)
-    base = LAW.path_load(PARTICLE, LAW.init(PARTICLE), FORCE)[1]
-    np.testing.assert_allclose(both - base, (parts[0] - base) + (parts[1] - base), atol=1e-12)
+    np.testing.assert_allclose(both - BASE, (parts[0] - BASE) + (parts[1] - BASE), atol=1e-12)
 
 
 def test_effects_act_through_each_other():
@@ -173,14 +156,8 @@ def test_effects_act_through_each_other():
     humidity, damage = (LIBRARY[n].variants[0].build(LIBRARY[n].variants[0].typical) for n in ("humidity", "damage"))
     one, other = (LAW.with_effects(*e).respond(PARTICLE, RECORD) for e in ((humidity, damage), (damage, humidity)))
     np.testing.assert_allclose(one, other, rtol=1e-12)
-    base = LAW.path_load(PARTICLE, LAW.init(PARTICLE), FORCE)[1]
-    alone = [LAW.with_effects(e).respond(PARTICLE, RECORD) - base for e in (humidity, damage)]
-    assert jnp.max(jnp.abs(one - base - alone[0] - alone[1])) > 1e-3
-
-
-def test_the_record_is_a_pytree_of_its_points():
-    assert isinstance(RECORD, Record)
-    assert {x.shape for x in jax.tree.leaves(RECORD)} == {FORCE.shape, ()}
+    alone = [LAW.with_effects(e).respond(PARTICLE, RECORD) - BASE for e in (humidity, damage)]
+    assert jnp.max(jnp.abs(one - BASE - alone[0] - alone[1])) > 1e-3
 
 
 @pytest.mark.extended

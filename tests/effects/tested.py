@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import paper_law, paper_particle, with_dtype
+from helpers import paper_law, paper_particle
 
 from mcc_jax.calibrate.forward import Forms
 from mcc_jax.effects import LIBRARY, clean_record
@@ -14,7 +14,7 @@ from mcc_jax.law import Unloading, signatures
 
 MECHANISMS = tuple(LIBRARY)
 VARIANTS = tuple(variant for mechanism in LIBRARY.values() for variant in mechanism)
-NAMES = [f"{v.mechanism}:{v.name}" for v in VARIANTS]
+NAMES = [v.label for v in VARIANTS]
 PARTICLE = paper_particle(3)
 LAW = paper_law()
 HUMIDITY = 65.0
@@ -30,13 +30,8 @@ TURNS = np.array(
 )  # fmt: skip
 
 
-def tested_path():
-    """Times [s] and forces [mN], every turn included."""
-    time = np.sort(np.concatenate([np.linspace(0, TURNS[-1, 0], 90), TURNS[:, 0], [40.0, 300.0]]))
-    return time, np.interp(time, TURNS[:, 0], TURNS[:, 1])
-
-
-TIME, FORCE = (jnp.asarray(x) for x in tested_path())
+TIME = jnp.asarray(np.sort(np.concatenate([np.linspace(0, TURNS[-1, 0], 90), TURNS[:, 0], [40.0, 300.0]])))
+FORCE = jnp.asarray(np.interp(TIME, TURNS[:, 0], TURNS[:, 1]))
 RECORD = clean_record(FORCE, TIME, relative_humidity=jnp.asarray(HUMIDITY))
 START, MIDDLE = 1e-3, 1e-3  # steps of finite differences over the typical amplitude
 
@@ -51,6 +46,18 @@ def latent_law():
 
 def respond(variant, amplitude, law=LAW, record=RECORD, particle=PARTICLE, **nuisance):
     return law.with_effects(variant.build(amplitude, **nuisance)).respond(particle, record)
+
+
+def base(record=RECORD, particle=PARTICLE):
+    return LAW.path_load(particle, LAW.init(particle), record.force)[1]
+
+
+BASE = np.asarray(base())
+
+
+def added(variant, amplitude, record=RECORD, **nuisance):
+    """What an effect adds along a record [um]."""
+    return np.asarray(respond(variant, amplitude, record=record, **nuisance) - base(record))
 
 
 @functools.cache
@@ -87,7 +94,3 @@ def signature_rows(one, other):
     both = jax.tree.map(lambda *leaves: jnp.stack([padded(leaf) for leaf in leaves]), one, other)
     rows = np.asarray(_signature_rows()(both))
     return rows[0][:, : one.force.size], rows[1][:, : other.force.size]
-
-
-def single(tree):
-    return with_dtype(tree, jnp.float32)
