@@ -1,4 +1,7 @@
-"""Sizes, shape factors and the conversion between curves and force-displacement."""
+"""Sizes, shape factors and the conversion between curves and force-displacement.
+
+Those of the paper's particles are columns of `tests/law/test_particles_table.py`.
+"""
 
 import equinox as eqx
 import hypothesis.strategies as st
@@ -6,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import A, between, check, close, exact_elastic_shape_factor, paper_particle, sphere
+from helpers import A, between, check, close, paper_particle, sphere
 from hypothesis import given, settings
 
 from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM
@@ -31,26 +34,6 @@ def sizes_and_shapes(particle, a):
     )
 
 
-@pytest.mark.parametrize(
-    ("number", "diameter", "eta_p"),
-    [
-        (1, "224.702344228", "1.24420062209"),
-        (6, "135.70384106", "1.87308503422"),
-        (12, "187.299122332", "1.41395466231"),
-        (16, "361.033753754", "1.55948471789"),
-    ],
-)
-def test_paper_particles(number, diameter, eta_p):
-    particle = paper_particle(number)
-    check(particle.effective_diameter, diameter)
-    check(2 * particle.effective_radius, diameter)
-    check(plastic_shape_factor(particle, A), eta_p)
-
-
-def test_elastic_shape_factor_of_a_particle_with_D1_below_D2():
-    check(elastic_shape_factor(paper_particle(12)), "1.01948420441")
-
-
 def test_sphere():
     for size in (1e-3, 1.0, 100.0, 1e4):
         for a in (-0.85, 0.0, A):
@@ -69,44 +52,6 @@ def test_definitions_as_the_paper_words_them():
     close(p.flatness, 1 - 75 / p.effective_diameter, rel=1e-15)
     close(plastic_shape_factor(p, 0.7), 1 + 0.7 * (1 - 75**2 / (120 * 90)), rel=1e-15)
     assert plastic_shape_factor(p, -0.85) < 1 < plastic_shape_factor(p, 0.1)
-
-
-def test_effective_and_mean_diameter_of_the_papers_particles(particles):
-    effective, *_, mean = eqx.filter_vmap(sizes_and_shapes, in_axes=(0, None))(particles, A)
-    effective, mean = np.asarray(effective), np.asarray(mean)
-    check(np.mean(mean / effective), "0.77864")
-    check(np.min(mean / effective), "0.548")
-    check(np.max(mean / effective), "0.989")
-    check(mean.min(), "74.4")
-    check(mean.max(), "261.3")
-
-
-def test_printed_elastic_shape_factor_is_no_number_when_D1_is_the_smaller(particles):
-    """(D1/D2)^0.1368 - 1 < 0 has no power 1.531; the library takes the larger over the smaller and agrees elsewhere."""
-    with np.errstate(invalid="ignore"):
-        ratio = np.asarray(particles.D1 / particles.D2)
-        printed = 1 / (1 - (ratio**0.1368 - 1) ** 1.531)
-    symmetric = eqx.filter_vmap(elastic_shape_factor)(particles)
-    assert np.isnan(printed).sum() == 12
-    np.testing.assert_array_equal(np.isnan(printed), ratio < 1)
-    close(symmetric[ratio >= 1], printed[ratio >= 1], rel=1e-14)
-    assert np.all(np.isfinite(symmetric))
-
-
-@pytest.mark.parametrize(
-    ("ratio", "percent"),
-    [
-        (213.54 / 196.07, "0.07"),
-        (217.51 / 155.32, "0.31"),
-        (205.93 / 121.04, "0.39"),
-        (2.0, "0.36"),
-        (3.0, "0.06"),
-        (5.0, "-0.37"),
-    ],
-)
-def test_elastic_shape_factor_against_the_exact_contact(ratio, percent):
-    particle = Particle(ratio, 1.0, 1.0)
-    check(100 * (elastic_shape_factor(particle) / exact_elastic_shape_factor(ratio) - 1), percent)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

@@ -22,28 +22,21 @@ def traced():
     return function, count
 
 
-def limit(monkeypatch, tmp_path, text):
-    file = tmp_path / "max_map_count"
-    file.write_text(text)
-    monkeypatch.setattr(_memory, "MAX_MAPS", file)
-
-
 @pytest.mark.skipif(not _memory.MAPS.exists(), reason="only Linux limits memory maps, and shows them")
-@pytest.mark.parametrize(("most", "times"), [(10, 2), (10**9, 1)])
-def test_compiled_functions_are_forgotten_near_the_limit_only(traced, monkeypatch, tmp_path, most, times):
+@pytest.mark.parametrize(("limit", "times"), [("10\n", 2), (f"{10**9}\n", 1), ("", 1), ("many", 1)])
+def test_compiled_functions_are_forgotten_near_a_known_limit_only(traced, monkeypatch, tmp_path, limit, times):
     function, count = traced
-    limit(monkeypatch, tmp_path, f"{most}\n")
+    file = tmp_path / "max_map_count"
+    file.write_text(limit)
+    monkeypatch.setattr(_memory, "MAX_MAPS", file)
     make_room()
     assert function(jnp.ones(3)).tolist() == [2, 2, 2]
     assert len(count) == times
 
 
-@pytest.mark.parametrize("text", [None, "", "many"])
-def test_nothing_happens_where_the_limit_is_not_known(traced, monkeypatch, tmp_path, text):
+def test_nothing_happens_where_no_maps_are_shown(traced, monkeypatch, tmp_path):
     function, count = traced
-    limit(monkeypatch, tmp_path, text or "")
-    if text is None:
-        monkeypatch.setattr(_memory, "MAPS", tmp_path / "none")
+    monkeypatch.setattr(_memory, "MAPS", tmp_path / "none")
     make_room()
     function(jnp.ones(3))
     assert len(count) == 1

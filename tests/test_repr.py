@@ -131,30 +131,17 @@ def test_what_jax_traces_is_told_too():
     assert all(len(text.splitlines()) <= MOST_LINES for text in told)
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "None"),
-        (True, "True"),
-        (3, "3 um"),
-        (0.00001, "1 × 10⁻⁵ um"),
-        ("", "none"),
-        ("a" * 200, "a" * 67 + "..."),
-        (b"abc", "3 bytes"),
-        (np.array([]), "no values"),
-        (np.array([1.0, 2.0]), "[1, 2] um"),
-        (np.full((2, 5), np.nan), "2 × 5 values, none finite"),
-        (np.arange(6.0), "6 values, 0 to 5 um"),
-        (np.array([True, False, True]), "2 of 3 true"),
-        (np.array(["a", "b"]), "2 of <U1"),
-        ((), "none"),
-        ((None, None), "None, None"),
-        (tuple(np.zeros(100)), "100 of float64"),
-        ({"a": 1}, "a 1"),
-        (mcc.Unloading.PUNCH, "punch"),
-        (len, "len"),
-    ],
-)
+IN_WORDS = [
+    (None, "None"), (True, "True"), (3, "3 um"), (0.00001, "1 × 10⁻⁵ um"), ("", "none"),
+    ("a" * 200, "a" * 67 + "..."), (b"abc", "3 bytes"), (np.array([]), "no values"),
+    (np.array([1.0, 2.0]), "[1, 2] um"), (np.full((2, 5), np.nan), "2 × 5 values, none finite"),
+    (np.arange(6.0), "6 values, 0 to 5 um"), (np.array([True, False, True]), "2 of 3 true"),
+    (np.array(["a", "b"]), "2 of <U1"), ((), "none"), ((None, None), "None, None"),
+    (tuple(np.zeros(100)), "100 of float64"), ({"a": 1}, "a 1"), (mcc.Unloading.PUNCH, "punch"), (len, "len"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("value", "text"), IN_WORDS)
 def test_values_in_words(value, text):
     assert in_words(value, "um") == text
 

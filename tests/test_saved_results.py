@@ -90,16 +90,13 @@ def test_the_page_shows_it(calibration, tmp_path):
     assert ("band" in page) or calibration.to_json()["method"] != "bayes"
 
 
-def test_a_campaign_is_loaded_too(campaign, tmp_path):
+def test_a_campaign_is_loaded_too_and_an_empty_folder_is_one_line(campaign, tmp_path):
+    with pytest.raises(mcc.InputError, match="no result and no campaign"):
+        mcc.load(tmp_path)
     mcc.write_campaign(campaign, tmp_path)
     again = mcc.load(tmp_path)
     assert again.particles == campaign.particles
     np.testing.assert_array_equal(again.curves[3].force_mN, campaign.curves[3].force_mN)
-
-
-def test_an_empty_folder_is_one_line(tmp_path):
-    with pytest.raises(mcc.InputError, match="no result and no campaign"):
-        mcc.load(tmp_path)
 
 
 @pytest.mark.extended

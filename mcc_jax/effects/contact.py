@@ -38,8 +38,7 @@ class Toe(AbstractEffect):
 _FLATTENING = (0.05, 0.1, 0.18, 0.3, 0.55, 1.0, 3.0)
 """Stresses [MPa]: rough cellulose up to 1, ceramic pebbles 3 and more, a twelfth of what crushes them."""
 
-TOE = family(
-    Toe, "toe_asperity",
+TOE = family(Toe, "toe_asperity",
     "Asperities are flattened before the particle itself carries load: a soft toe at the beginning.",
     row("exponential", "d = D_e d_t (1 - exp(-sigma_P / s))",
         "Asperities of exponentially distributed height; once flat they stay flat."),
@@ -80,8 +79,8 @@ class Tilt(AbstractEffect):
 
 _LEVELLED = Nuisance("radius_share", (0.1, 0.3), (0.02, 2.0), "radius of levelling over D_e")
 
-MISALIGNMENT = family(
-    Tilt, "misalignment", "The platens are tilted against each other: the contact first closes a wedge.",
+MISALIGNMENT = family(Tilt, "misalignment",
+    "The platens are tilted against each other: the contact first closes a wedge.",
     row("edge", "d = alpha a_P", "The wedge under the contact's radius at the peak."),
     row("elastic", "d = alpha a", "The wedge opens again as the contact shrinks.", shrinks=1.0),
     row("levelling", "d = alpha a_c (1 - exp(-a_P / a_c)), a_c = share D_e", "The force levels the platens.",
@@ -111,8 +110,7 @@ class PopIn(AbstractEffect):
         return self.amplitude * pick(self.per_diameter, context.particle.displacement(jump), jump)
 
 
-POP_IN = family(
-    PopIn, "pop_in",
+POP_IN = family(PopIn, "pop_in",
     "Something breaks inside the particle at a certain load: the platen drops by a step, anywhere in a test.",
     row("sharp", "d = J H(sigma_P - sigma_j)", "A jump, in some tests or all, at a stress of its own in each."),
     row("gradual", "d = J S(sigma_P; sigma_j -+ 15 %)", "A break that takes a while.", gradual=1.0),

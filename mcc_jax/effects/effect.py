@@ -29,17 +29,15 @@ class AbstractEffect(eqx.Module):
 
     Hooks are plain arithmetic on scalars or arrays over points, so that `vmap`, `jvp` and `grad` pass through. They
     must be finite with finite derivatives at zero force, on full release, at repeated points and at amplitude zero,
-    where they must change nothing.
-
-    Where the hooks are the same for several formulas that differ in one expression, `formulas` holds the expressions,
-    functions of the effect and of what its hook gives them. A field that switches a part of a formula on is a number, 0
-    or 1: formulas that differ in it alone are compiled once where many are derived together (`mcc_jax.law.signatures`).
+    where they must change nothing. A field that switches a part of a formula on is a number, 0 or 1: formulas that
+    differ in it alone are compiled once where many are derived together (`mcc_jax.law.signatures`).
 
     Attributes:
         closed: whether all it does is a formula of particle and peak, without time, cycles or the room: `modify` of the
             particle alone, or the `AbstractModulusAtPeak`. Energy, particle codes and exports to other engines take
             those only. Set it on the class.
-        formulas: expressions by name. Set it on the class.
+        formulas: where the hooks of several formulas differ in one expression, these by name: functions of the effect
+            and of what its hook gives them. Set it on the class.
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
         formula: the name of the expression of this effect.
         label: "mechanism:variant" where a `Variant` built it; by it results and messages name the effect.

@@ -173,15 +173,14 @@ def _tau(*grid: float) -> Nuisance:
     return Nuisance("tau_s", grid, (0.3, 3000.0), "retardation time")
 
 
-_MCC = "Zhupanska et al. (2002), creep and relaxation of MCC; Oyen and Cook (2003), J. Mater. Res. 18, 139"
 _HELD = {"make": HoldCreep, "needs": (Need.HOLD,), "helps": (Need.SEVERAL_PEAKS,)}
 
-CREEP = family(
-    LinearCreep, "creep",
+CREEP = family(LinearCreep, "creep",
     "The particle goes on deforming under constant force; at reversal the displacement still grows for a while.",
     row("kelvin_voigt", "tau dy/dt + y = sigma; d = D_e c y",
         "A spring in parallel with a dashpot: delayed, bounded and fully recovered.",
-        _tau(5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0), source=_MCC),
+        _tau(5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0),
+        source="Zhupanska et al. (2002), creep and relaxation of MCC; Oyen and Cook (2003), J. Mater. Res. 18, 139"),
     row("logarithmic", "d = D_e c [ln(1 + t / tau) convolved with d sigma]",
         "Many retardation times: slower and slower, without end.", _tau(1.0, 10.0, 100.0),
         source="Nowick and Berry (1972), ch. 4"),
@@ -236,8 +235,7 @@ class ReloadHysteresis(AbstractEffect):
         return -self.amplitude * context.recoverable * (1 - context.reload_from_share) * lag
 
 
-HYSTERESIS = family(
-    ReloadHysteresis, "reload_hysteresis",
+HYSTERESIS = family(ReloadHysteresis, "reload_hysteresis",
     "Reloading does not retrace unloading: a loop opens that dissipates work at any rate.",
     row("parabolic", "d = -Delta h (1 - u_r) 4 w (1 - w), w = (F - F_r) / (F_P - F_r)",
         "A loop that is widest half way."),
@@ -284,8 +282,8 @@ class Ratcheting(AbstractEffect):
 
 _CHABOCHE = "Lemaitre and Chaboche (1990), Mechanics of Solid Materials, ch. 5"
 
-RATCHETING = family(
-    Ratcheting, "ratcheting", "Every cycle leaves some more permanent displacement, without any higher load.",
+RATCHETING = family(Ratcheting, "ratcheting",
+    "Every cycle leaves some more permanent displacement, without any higher load.",
     row("linear", "d = D_e r N", "The same with every reload."),
     row("logarithmic", "d = D_e r ld(1 + N)", "Less with every reload."),
     row("shakedown", "d = D_e r N_0 (1 - exp(-N / N_0))", "It comes to rest.",

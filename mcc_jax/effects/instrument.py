@@ -16,8 +16,6 @@ REFERENCE_TIME_S = 100.0
 LAYER_UM = 10.0
 
 _SNEDDON = "Sneddon (1965), Int. J. Eng. Sci. 3, 47"
-_PUNCH = f"{_SNEDDON}; Johnson (1985), Contact Mechanics, ch. 3"
-_OLIVER = "Oliver and Pharr (1992), J. Mater. Res. 7, 1564; Doerner and Nix (1986), J. Mater. Res. 1, 601"
 
 
 class _Observed(AbstractEffect):
@@ -48,11 +46,11 @@ class FrameCompliance(_Observed):
 
 _SEATS = (10.0, 22.0, 50.0, 110.0, 250.0)
 
-FRAME = family(
-    FrameCompliance, "frame_compliance",
+FRAME = family(FrameCompliance, "frame_compliance",
     "The frame, load cell and glue of the instrument give way under force, and the read-out counts that as the "
     "particle's.",
-    row("linear", "d = C F", "A linear spring in series with the particle.", source=_OLIVER),
+    row("linear", "d = C F", "A linear spring in series with the particle.",
+        source="Oliver and Pharr (1992), J. Mater. Res. 7, 1564; Doerner and Nix (1986), J. Mater. Res. 1, 601"),
     row("hertzian_seat", "d = C F (F / 100 mN)^(-1/3)",
         "A seat with a rounded contact: stiffer the harder it is pressed, d ~ F^(2/3).",
         source="Hertz; Johnson (1985), Contact Mechanics, ch. 4"),
@@ -94,8 +92,7 @@ class ThermalDrift(_Observed):
 
 _SETTLING = (10.0, 16.0, 25.0, 40.0, 63.0, 100.0, 160.0)
 
-DRIFT = family(
-    ThermalDrift, "thermal_drift",
+DRIFT = family(ThermalDrift, "thermal_drift",
     "The instrument warms up or cools down during the test: the read-out moves with time, whatever the force.",
     row("linear", "d = v t", "A constant speed, another one in every test."),
     row("settling", "d = v tau (1 - exp(-t / tau))", "A temperature that settles after the sample was placed.",
@@ -123,6 +120,8 @@ def _floored(context: Context, radius: Values) -> Values:
 
 def _flat(e: PlatenSinkIn, c: Context) -> Values:
     radius = _floored(c, pick(e.shrinks, c.contact_radius, c.peak_contact_radius))
+    if e.punch_radius_um is not None:
+        radius = jnp.where(radius < e.punch_radius_um, radius, e.punch_radius_um)
     return e.amplitude * c.force / (2 * radius)
 
 
@@ -136,11 +135,6 @@ def _layer(e: PlatenSinkIn, c: Context) -> Values:
     return e.amplitude * c.force * LAYER_UM / (jnp.pi * radius * radius)
 
 
-def _finite_punch(e: PlatenSinkIn, c: Context) -> Values:
-    radius = _floored(c, c.peak_contact_radius)
-    return e.amplitude * c.force / (2 * jnp.where(radius < e.punch_radius_um, radius, e.punch_radius_um))
-
-
 class PlatenSinkIn(_Observed):
     """Elastic platens that give way under the contact, as a half space does under a rigid flat punch of its radius.
 
@@ -151,16 +145,11 @@ class PlatenSinkIn(_Observed):
     shrinks: float = 0.0
     punch_radius_um: Any = None
 
-    formulas: ClassVar = {
-        "flat": _flat,
-        "yield_pressure": _yield_pressure,
-        "layer": _layer,
-        "finite_punch": _finite_punch,
-    }
+    formulas: ClassVar = {"flat": _flat, "yield_pressure": _yield_pressure, "layer": _layer}
 
 
-SINK_IN = family(
-    PlatenSinkIn, "platen_sink_in", "The platens are no rigid planes: the contact sinks into them.",
+SINK_IN = family(PlatenSinkIn, "platen_sink_in",
+    "The platens are no rigid planes: the contact sinks into them.",
     row("flat", "d = F / (2 a_P E*)", "The contact presses like a punch of its widest radius."),
     row("current_contact", "d = F / (2 a E*)", "The same with the radius left on unloading.", formula="flat",
         shrinks=1.0),
@@ -169,8 +158,9 @@ SINK_IN = family(
     row("layer", "d = F h / (pi a_P^2 E), h = 10 um", "A thin soft layer, dust or glue.",
         source="Johnson (1985), sec. 5.8", plausible=(0.3, 30.0)),
     row("finite_punch", "d = F / (2 min(a_P, R_punch) E*)", "The contact grows until it is as wide as the punch.",
-        Nuisance("punch_radius_um", (50.0, 100.0), (20.0, 500.0), "radius of the flat punch")),
-    parameter="inverse_modulus_per_GPa", unit="1/GPa", plausible=(0.01, 1.0), source=_PUNCH, needs=(Need.UNLOADING,),
+        Nuisance("punch_radius_um", (50.0, 100.0), (20.0, 500.0), "radius of the flat punch"), formula="flat"),
+    parameter="inverse_modulus_per_GPa", unit="1/GPa", plausible=(0.01, 1.0),
+    source=f"{_SNEDDON}; Johnson (1985), Contact Mechanics, ch. 3", needs=(Need.UNLOADING,),
     helps=(Need.SEVERAL_SIZES, Need.HOLD), equivalences=("the width of the punch, as long as no contact is wider",),
     check="repeat on a platen of diamond or sapphire", coordinates=("peak", "load", "size"),
 )  # fmt: skip

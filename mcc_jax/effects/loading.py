@@ -65,14 +65,13 @@ class RateOfFlowAndModulus(RateDependence):
         return self.factor(context.record.rate / REFERENCE_FORCE_RATE) + jnp.zeros_like(context.peak_strain)
 
 
-_RATE = "Roberts and Rowe (1985), Chem. Eng. Sci. 40, 4; Schmalbach et al. (2021), J. Mater. Res."
 _EYRING = "Eyring (1936), J. Chem. Phys. 4, 283; Ree and Eyring (1955), J. Appl. Phys. 26, 793"
 _ACTIVATED = Nuisance("rate_share", (0.1, 1.0, 10.0), (0.01, 100.0), "strain rate of the crossover over 0.002/s")
 _TWO_RATES = (Need.TWO_RATES,)  # the other rates vary along one test and from size to size: one force rate shows them
 _YIELD, _HARDENING = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
-RATE = family(
-    RateDependence, "rate_dependence", "The faster the particle is loaded, the harder it is to deform plastically.",
+RATE = family(RateDependence, "rate_dependence",
+    "The faster the particle is loaded, the harder it is to deform plastically.",
     row("yield_log_strain_rate", "C1 (1 + m ln(eps' / 0.002/s))",
         "Only the yield term C1 grows, with the logarithm of the strain rate.", terms=_YIELD),
     row("flow_log_strain_rate", "sigma(eps) (1 + m ln(eps' / 0.002/s))",
@@ -96,7 +95,8 @@ RATE = family(
         formula="eyring"),
     row("yield_eyring", "C1 [1 + m asinh(eps' / (r 0.002/s))]", "The same of the yield term C1 only.", _ACTIVATED,
         source=_EYRING, formula="eyring", terms=_YIELD),
-    formula="logarithm", parameter="rate_sensitivity", plausible=(0.003, 0.1), source=_RATE,
+    formula="logarithm", parameter="rate_sensitivity", plausible=(0.003, 0.1),
+    source="Roberts and Rowe (1985), Chem. Eng. Sci. 40, 4; Schmalbach et al. (2021), J. Mater. Res.",
     helps=(Need.SEVERAL_SIZES,), equivalences=("size_effect, at one force rate",),
     check="load at two rates or more within one class of sizes", coordinates=("peak", "rate"),
 )  # fmt: skip
@@ -135,8 +135,7 @@ class PlatenFriction(LoadingFactor):
     }
 
 
-FRICTION = family(
-    PlatenFriction, "platen_friction",
+FRICTION = family(PlatenFriction, "platen_friction",
     "The platens hold the spreading contact back, so that the particle carries more the flatter it gets.",
     row("siebel", "sigma(eps) [1 + (2 mu / 3) a / h]",
         "Mean pressure of the friction hill on a disc of radius a and height h.", source="Siebel (1923)"),
@@ -197,11 +196,9 @@ class HardeningAndContact(Hardening):
         return context.recoverable * jnp.where(some, share - power, 0.0)
 
 
-_STORAKERS = "Biwa and Storakers (1995); Storakers, Biwa and Larsson (1997), Int. J. Solids Struct. 34, 3061"
 _OLSSON = "Olsson and Larsson (2013)"
 
-HARDENING = family(
-    Hardening, "finite_hardening_exponent",
+HARDENING = family(Hardening, "finite_hardening_exponent",
     "The material hardens as a power of strain instead of flowing at one stress: the curve bends the other way at low "
     "load.",
     row("linear_term", "C1 eta eps (eps / 0.2)^(1/2m)",
@@ -223,6 +220,8 @@ HARDENING = family(
     row("every_term_and_unloading", "sigma(0.2 (eps / 0.2)^(1 + 1/2m)); on unloading u^(1/(1 + 1/2m)) for u",
         "The same, and on the pressure that unloading releases.", source=_OLSSON, plausible=(0.02, 2.0),
         make=HardeningAndLoad, every_term=True),
-    formula="power", parameter="inverse_exponent", plausible=(0.01, 0.5), source=_STORAKERS, helps=(Need.LOW_LOAD,),
-    check="repeat between polished platens, or indent a compact of the same powder", coordinates=("peak", "load"),
+    formula="power", parameter="inverse_exponent", plausible=(0.01, 0.5),
+    source="Biwa and Storakers (1995); Storakers, Biwa and Larsson (1997), Int. J. Solids Struct. 34, 3061",
+    helps=(Need.LOW_LOAD,), check="repeat between polished platens, or indent a compact of the same powder",
+    coordinates=("peak", "load"),
 )  # fmt: skip

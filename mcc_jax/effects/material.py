@@ -61,8 +61,7 @@ class SizeEffect(Strength):
     }
 
 
-SIZE = family(
-    SizeEffect, "size_effect",
+SIZE = family(SizeEffect, "size_effect",
     "Small particles are stronger than large ones of the same material (or weaker, if they are more porous).",
     row("C1", "C1 (D_e / 200 um)^-n", "The yield term depends on size."),
     row("flow", "sigma(eps) (D_e / 200 um)^-n", "The whole loading curve depends on size.", terms=_FLOW),
@@ -108,8 +107,7 @@ class SecondOrderShape(AbstractEffect):
         return Formulas(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
 
 
-SHAPE = family(
-    SecondOrderShape, "shape_second_order",
+SHAPE = family(SecondOrderShape, "shape_second_order",
     "The shape factor is not linear in flatness, or the outline in the plane of the platens matters, too.",
     row("flatness_squared", "eta_p (1 + b q^2), q = 1 - D3^2/(D1 D2)", "The next term in flatness."),
     row("flatness_exponential", "eta_p exp(b q^2)", "The same, never negative."),
@@ -124,10 +122,6 @@ SHAPE = family(
 )  # fmt: skip
 
 
-def _dampness(record: Record) -> Scalar:
-    return record.relative_humidity - REFERENCE_HUMIDITY_PERCENT
-
-
 class Humidity(Strength):
     """Water softens the particle; with a `modulus_share` the modulus at so many times the rate of C1."""
 
@@ -135,8 +129,8 @@ class Humidity(Strength):
     threshold_percent: Any = None
 
     formulas: ClassVar = {
-        "exponential": lambda e, _, r: jnp.exp(-e.amplitude * _dampness(r)),
-        "linear": lambda e, _, r: 1 - e.amplitude * _dampness(r),
+        "exponential": lambda e, _, r: jnp.exp(-e.amplitude * (r.relative_humidity - REFERENCE_HUMIDITY_PERCENT)),
+        "linear": lambda e, _, r: 1 - e.amplitude * (r.relative_humidity - REFERENCE_HUMIDITY_PERCENT),
         "threshold": lambda e, _, r: jnp.exp(-e.amplitude * positive(r.relative_humidity - e.threshold_percent)),
     }
 
@@ -147,8 +141,8 @@ class Humidity(Strength):
         return scaled(law, first, jnp.ones_like(first), first**self.modulus_share)
 
 
-HUMIDITY = family(
-    Humidity, "humidity", "Water in the particle softens it: in humid air it deforms under less stress.",
+HUMIDITY = family(Humidity, "humidity",
+    "Water in the particle softens it: in humid air it deforms under less stress.",
     row("C1_and_modulus", "C1 exp(-k (RH - 45)) and E exp(-r k (RH - 45))",
         "The yield term softens, and the modulus with it.",
         Nuisance("modulus_share", (0.5, 1.0), (0.0, 3.0), "rate of E over that of C1")),
@@ -205,8 +199,8 @@ class CyclicDamage(AbstractEffect):
         return 1 / at_least(1 + self.amplitude * context.cycles)
 
 
-DAMAGE = family(
-    Damage, "damage", "Bonds break while the particle is squeezed: the further it went, the softer it unloads.",
+DAMAGE = family(Damage, "damage",
+    "Bonds break while the particle is squeezed: the further it went, the softer it unloads.",
     row("exponential", "E exp(-kappa eps_P)", "A share of the bonds breaks per unit of strain."),
     row("linear", "E (1 - kappa eps_P)", "Damage in proportion to strain."),
     row("rational", "E / (1 + kappa eps_P)", "The compliance of cracks is added."),
@@ -243,14 +237,13 @@ class Locking(LoadingFactor):
     formulas: ClassVar = {"locking": _locking_power, "locking_exponential": _locking_exponential}
 
 
-_SPRIGGS = "Spriggs (1961), J. Am. Ceram. Soc. 44, 628"
 _FOAM = "Gibson and Ashby (1997), Cellular Solids, ch. 5"
 _LOADING = {"make": Locking, "needs": (), "helps": (Need.SEVERAL_PEAKS,)}
 
-DENSIFICATION = family(
-    Densification, "densification_stiffening",
+DENSIFICATION = family(Densification, "densification_stiffening",
     "Pores close while the particle is squeezed: the further it went, the stiffer it is.",
-    row("exponential", "E exp(b eps_P)", "Porosity falls with strain; E = E_0 exp(-b p).", source=_SPRIGGS),
+    row("exponential", "E exp(b eps_P)", "Porosity falls with strain; E = E_0 exp(-b p).",
+        source="Spriggs (1961), J. Am. Ceram. Soc. 44, 628"),
     row("linear", "E (1 + b eps_P)", "The modulus grows in proportion to strain."),
     row("cellular", "E (1 + b eps_P / 2)^2", "The square of a density that grows with strain.",
         source="Gibson and Ashby (1982), Proc. R. Soc. A 382, 43"),

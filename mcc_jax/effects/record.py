@@ -22,8 +22,6 @@ REFERENCE_HUMIDITY_PERCENT = 45.0
 """Relative humidity of a test that names none; there no effect of humidity acts."""
 
 Codes = Int[Array, "..."]
-
-
 SMALL = 1e-8
 
 

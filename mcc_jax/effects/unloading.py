@@ -55,8 +55,8 @@ class RecoveryExponent(AbstractEffect):
         return context.recoverable * jnp.where(some, s * (1 - power), 0.0)
 
 
-SHAPE_OF_UNLOADING = family(
-    Bow, "unloading_shape", "The unloading curve has another shape than the arcsine, with the same two ends.",
+SHAPE_OF_UNLOADING = family(Bow, "unloading_shape",
+    "The unloading curve has another shape than the arcsine, with the same two ends.",
     row("symmetric_bow", "d = Delta k 4 u (1 - u)", "Bent most at half load."),
     row("tail_bow", "d = Delta k 6.75 u (1 - u)^2", "Bent most towards release."),
     row("onset_bow", "d = Delta k 6.75 u^2 (1 - u)", "Bent most near the peak."),
@@ -137,8 +137,8 @@ _GENERAL = "phi = a/a_P, u' = u + 4 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) 
 _COHESIVE = "Needleman (1987), J. Appl. Mech. 54, 525; Olsson and Larsson (2013)"
 _MOBILISED = Nuisance("mobilised_share", (0.25, 0.4, 0.6), (0.05, 1.0), "recovered share at which half of it pulls")
 
-ADHESION = family(
-    Adhesion, "adhesion", "The particle sticks to the platens: on unloading it recovers less at the same force.",
+ADHESION = family(Adhesion, "adhesion",
+    "The particle sticks to the platens: on unloading it recovers less at the same force.",
     row("jkr_nominal", f"g = phi^1.5 s; {_SECTION}",
         "A crack closes in from the contact's edge; the stress is counted over the particle's section.",
         source="Johnson, Kendall and Roberts (1971); Mesarovic and Johnson (2000), J. Mech. Phys. Solids 48, 2009",
@@ -210,8 +210,7 @@ class Reversal(AbstractEffect):
 _OF_SIZE = {"of_size": 1.0, "parameter": "reverse_strain", "plausible": (2e-4, 1e-2)}
 _OF_RECOVERY = {"of_recovery": 1.0, "parameter": "recovery_share", "plausible": (1e-2, 0.5)}
 
-REVERSAL = family(
-    Reversal, "reverse_plasticity",
+REVERSAL = family(Reversal, "reverse_plasticity",
     "Close to release the compressed core yields backwards: the particle recovers more than elastically.",
     row("quartic_strain", "d = -D_e c (1 - u)^4", "Most of it close to release, the same strain for every particle.",
         formula="power", **_OF_SIZE),
