@@ -10,8 +10,6 @@ import pytest
 from helpers import with_dtype
 from tested import BASE, FORCE, LAW, NAMES, PARTICLE, RECORD, START, VARIANTS, lanes, respond, signature_rows
 
-from mcc_jax.effects import LIBRARY
-
 EVERY = pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 
 
@@ -49,23 +47,16 @@ def test_signatures_are_the_derivatives_at_the_null():
         np.testing.assert_allclose(row, exact, atol=1e-9 * np.abs(exact).max(), rtol=0)
 
 
-FEW = tuple(mechanism.variants[0] for mechanism in LIBRARY.values())
-"""One of each mechanism: a law with all variants takes long to compile."""
-
-
-def together(amplitudes, variants, law=LAW, particle=PARTICLE, record=RECORD):
-    effects = tuple(v.build(a) for v, a in zip(variants, amplitudes, strict=True))
-    return law.with_effects(*effects).respond(particle, record)
-
-
 @functools.cache
-def all_effects(variants, dtype):
-    """Effects in one law, compiled once: base, null, and in double precision the derivatives by reverse mode."""
+def all_effects(dtype):
+    """Every variant in one law, compiled once: base, null, and in double precision the derivatives by reverse mode."""
     law, particle, record = (with_dtype(t, dtype) for t in (LAW, PARTICLE, RECORD))
     base = jax.jit(lambda law, p, f: law.path_load(p, law.init(p), f)[1])(law, particle, record.force)
     weights = jnp.asarray(np.random.default_rng(1).normal(size=FORCE.size), dtype)
-    null = jnp.zeros(len(variants), dtype)
-    run = functools.partial(together, variants=variants, law=law, particle=particle, record=record)
+
+    def run(amplitudes):
+        effects = tuple(v.build(a) for v, a in zip(VARIANTS, amplitudes, strict=True))
+        return law.with_effects(*effects).respond(particle, record)
 
     @jax.jit
     def evaluate(null):
@@ -74,30 +65,25 @@ def all_effects(variants, dtype):
         value, pull = jax.vjp(run, null)
         return value, pull(weights)[0]
 
-    value, reverse = evaluate(null)
+    value, reverse = evaluate(jnp.zeros(len(VARIANTS), dtype))
     return np.asarray(base), np.asarray(value), np.asarray(reverse), np.asarray(weights)
 
 
-TOGETHER = pytest.mark.parametrize("variants", [FEW, VARIANTS], ids=["few", "all"])
-
-
 @pytest.mark.extended
-@TOGETHER
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_effects_at_their_null_leave_the_compiled_law_alone(variants, dtype):
-    base, value, reverse, _ = all_effects(variants, dtype)
+def test_effects_at_their_null_leave_the_compiled_law_alone(dtype):
+    base, value, reverse, _ = all_effects(dtype)
     assert value.dtype == dtype
     np.testing.assert_allclose(value, base, rtol=1e-12 if dtype == jnp.float64 else 2e-7)
     assert np.isfinite(reverse).all()
 
 
 @pytest.mark.extended
-@TOGETHER
-def test_reverse_mode_is_forward_mode(variants):
+def test_reverse_mode_is_forward_mode():
     """The gradient of a weighted sum at the null, by reverse mode all at once, against each derivative by forward."""
-    *_, reverse, weights = all_effects(variants, jnp.float64)
-    forward = np.array([weights @ lanes(variant)[1][0] for variant in variants])
-    scale = np.array([np.abs(weights * lanes(variant)[1][0]).sum() for variant in variants])
+    *_, reverse, weights = all_effects(jnp.float64)
+    forward = np.array([weights @ lanes(variant)[1][0] for variant in VARIANTS])
+    scale = np.array([np.abs(weights * lanes(variant)[1][0]).sum() for variant in VARIANTS])
     np.testing.assert_array_less(np.abs(forward - reverse), 1e-10 * scale)
 
 

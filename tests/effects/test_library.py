@@ -3,23 +3,13 @@
 import dataclasses
 import re
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tested import BASE, LAW, NAMES, PARTICLE, RECORD, VARIANTS, added, respond
+from tested import BASE, LAW, NAMES, PARTICLE, RECORD, VARIANTS, respond
 
-from mcc_jax.effects import (
-    LIBRARY,
-    AbstractEffect,
-    Mechanism,
-    Need,
-    Nuisance,
-    Variant,
-    default_library,
-    find_variant,
-)
+from mcc_jax.effects import LIBRARY, AbstractEffect, Mechanism, Nuisance, default_library, find_variant
 
 CONTRACT = [
     "frame_compliance", "thermal_drift", "creep", "rate_dependence", "adhesion", "damage", "densification_stiffening",
@@ -94,48 +84,6 @@ def test_descriptions_without_sense_are_refused():
         Mechanism("creep", "Twice.", (variant, variant))
     with pytest.raises(ValueError, match="is not one of"):
         Mechanism("other", "Another.", (variant,))
-
-
-# ---- an effect of one's own: all that it takes -----------------------------------------------------------------------
-
-
-class MagneticPull(AbstractEffect):
-    """A magnet under the platen that pulls more the closer it gets: d = -m D_e exp(-h / h_0)."""
-
-    range_um: jax.Array = eqx.field(converter=jnp.asarray)
-
-    def observe(self, context):
-        height = context.particle.D3 - context.displacement
-        return -self.amplitude * context.particle.displacement(jnp.exp(-height / self.range_um))
-
-
-MAGNET = Variant(
-    mechanism="magnet",
-    name="exponential",
-    make=MagneticPull,
-    parameter="pull_strain",
-    unit="-",
-    sign=1,
-    plausible=(1e-3, 1e-1),
-    equation="d = -m D_e exp(-h / h_0)",
-    explanation="A magnet pulls the platen.",
-    source="an example",
-    nuisances=(Nuisance("range_um", (30.0, 100.0), (1.0, 1000.0), "range of the magnet"),),
-    needs=(Need.UNLOADING,),
-)
-
-
-def test_an_effect_of_ones_own():
-    library = {**default_library(), "magnet": Mechanism("magnet", "A magnet pulls.", (MAGNET,))}
-    variant = find_variant("magnet", library)
-    np.testing.assert_allclose(respond(variant, 0.0), BASE, rtol=1e-12)
-    shift = added(variant, 0.01)
-    assert shift.max() < 0
-    assert shift.argmin() == np.argmax(BASE)
-    slope = jax.jvp(lambda a: respond(variant, a), (jnp.zeros(()),), (jnp.ones(()),))[1]
-    np.testing.assert_allclose(0.01 * slope, shift, rtol=1e-9)
-    both = LAW.with_effects(*(variant.build(0.01), LIBRARY["creep"].variants[0].build(1e-4)))
-    assert jnp.all(jnp.isfinite(both.respond(PARTICLE, RECORD)))
 
 
 class Careless(AbstractEffect):

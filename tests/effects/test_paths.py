@@ -49,23 +49,6 @@ def test_closed_form_is_the_scan():
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.extended
-def test_a_path_can_be_continued_from_its_state():
-    _, whole = along(EVERYTHING, FORCE, TIME)
-    half = FORCE.size // 2
-    halves = FORCE[: 2 * half].reshape(2, half), TIME[: 2 * half].reshape(2, half)
-
-    @jax.jit
-    def in_two(force, time):
-        return jax.lax.scan(
-            lambda past, now: EVERYTHING.path_load(PARTICLE, past, *now),
-            EVERYTHING.init(PARTICLE, jnp.asarray(HUMIDITY)),
-            (force, time),
-        )[1]
-
-    np.testing.assert_allclose(in_two(*halves).ravel(), whole[: 2 * half], rtol=1e-10, atol=1e-10)
-
-
 def test_respond_is_the_path_of_a_virgin_particle():
     np.testing.assert_allclose(
         eqx.filter_jit(MEMORIES.respond)(PARTICLE, RECORD), along(MEMORIES, FORCE, TIME)[1], rtol=1e-12

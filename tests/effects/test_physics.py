@@ -263,15 +263,11 @@ def test_the_whole_of_a_power_law_unloads_by_it():
     assert left[1.5] < 0.05 < min(left[1.2], left[2.0])
 
 
-@pytest.mark.extended
-def test_sizes_and_shapes_that_are_the_reference_feel_nothing():
+def test_sizes_and_shapes_that_are_the_reference_feel_nothing_and_small_particles_are_stronger():
     for name, particle in (("size_effect", sphere(200.0)), ("shape_second_order", sphere(150.0))):
         for variant in LIBRARY[name]:
             other = respond(variant, variant.typical, particle=particle)
             np.testing.assert_allclose(other, base(RECORD, particle), rtol=1e-12)
-
-
-def test_small_particles_are_stronger():
     small, record = sphere(100.0), clean_record(0.2 * FORCE, TIME)
     for variant in LIBRARY["size_effect"]:
         assert respond(variant, 0.3, particle=small, record=record).max() < base(record, small).max()
