@@ -26,7 +26,7 @@ from ..campaign import (
     stress_and_strain,
     turning_forces,
 )
-from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ..campaign.adjustment import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
 from ..campaign.record import humidities, record_columns
 from ..campaign.segments import contact_index
 from ..campaign.signal import point_noise

@@ -1,18 +1,21 @@
-"""Loading curves as strain over stress, and the paper's removal of the first, uncharacterised contact."""
+"""Loading curves as strain over stress, the paper's removal of the first contact, and why a test cannot be used."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from .. import arguments
+from .._errors import InputError
 from .._format import described
 from .findings import Finding
-from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
+from .plausibility import add_likely_unit_error
 from .schema import Campaign, Curve
 from .segments import Segment, contact_index, find_segments
+from .signal import median
 from .validate import check_campaign
 
 THRESHOLD_MPA = 0.2
@@ -22,6 +25,11 @@ MACHINE_ZERO = (-0.25, 1.0)
 test machine's zero to be the contact. Below, the platens would touch long before they meet; above, the test would have
 begun after more compression than it then shows. Beyond, the first reading is the contact."""
 LEAST_LEVELS = 2  # a loading curve of fewer points above the threshold has no course there
+FEW_FORCES = 5  # a record with no more different forces shows steps of its read-out, not a curve of three coefficients
+FAR_APART = 100.0
+"""Tests on one material end within this factor of each other in stress and in strain: the paper's end between 7 and 16
+MPa, and of the 801 stresses at which its method compares them a test so far below would see eight."""
+SHOWN = 3  # particles that an error names with their reasons, at most
 
 
 @dataclass(frozen=True)
@@ -74,9 +82,7 @@ def stress_and_strain(
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
     """
-    diameters_um = arguments.one_particle(diameters_um)
-    diameter = effective_diameter_um(diameters_um)
-    zero = _contact_um(curve, segments)
+    diameter, zero = effective_diameter_um(diameters_um), _contact_um(curve, segments)
     return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
 
 
@@ -90,20 +96,17 @@ def _contact_um(curve: Curve, segments: tuple[Segment, ...]) -> float:
 
 
 def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]) -> LoadingCurve | None:
-    """The virgin loading of a test, over all its cycles, as strain over stress.
+    """The virgin loading of a test, over all its cycles, as strain over stress; None if the test never loads.
 
     Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise; points that
-    share one force are averaged. Readings that may not be compared with a law do not count. None if the test never
-    loads.
+    share one force are averaged. Readings that may not be compared with a law do not count.
     """
-    diameters_um = arguments.one_particle(diameters_um)
     from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
 
-    virgin = [np.arange(s.start, s.stop) for s in segments if s.kind == "load"]
-    if not virgin:
-        return None
-    rows = np.concatenate(virgin)
-    rows = rows[curve.compared[rows]]
+    virgin = np.zeros(len(curve), bool)
+    for part in segments:
+        virgin[part.start : part.stop] = part.kind == "load"
+    rows = np.flatnonzero(virgin & curve.compared)
     if not len(rows):
         return None
     stress, strain = stress_and_strain(curve, diameters_um, segments)
@@ -165,26 +168,26 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     """
     segments = campaign_segments(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]
-    reasons = [
-        _why_not(*one, threshold_MPa) for one in zip(raw, campaign.curves, campaign.diameters_um, segments, strict=True)
-    ]
-    used = [c if r is None else None for c, r in zip(raw, reasons, strict=True)]
-    stress = [None if c is None else c.stress_max_MPa for c in used]
-    strain = [None if c is None else float(np.ptp(c.strain[1:])) for c in used]
-    reasons = [reason or apart for reason, apart in zip(reasons, far_apart(stress, strain), strict=True)]
-    kept = tuple(c if r is None else None for c, r in zip(raw, reasons, strict=True))
-    at_threshold = [None if c is None else float(c.at(threshold_MPa)) for c in kept]
-    known = [value for value in at_threshold if value is not None]
+    tests = list(zip(campaign.curves, campaign.diameters_um, segments, strict=True))
+    curves = [loading_curve(*test) for test in tests]
+    reasons = [_why_not(curve, *test, threshold_MPa) for curve, test in zip(curves, tests, strict=True)]
+    curves = [None if reason else curve for curve, reason in zip(curves, reasons, strict=True)]
+    stress = [None if curve is None else curve.stress_max_MPa for curve in curves]
+    strain = [None if curve is None else float(np.ptp(curve.strain[1:])) for curve in curves]
+    reasons = tuple(one or apart for one, apart in zip(reasons, far_apart(stress, strain), strict=True))
+    curves = tuple(None if reason else curve for curve, reason in zip(curves, reasons, strict=True))
+    known = {i: float(curve.at(threshold_MPa)) for i, curve in enumerate(curves) if curve is not None}
+    shift = np.zeros(len(curves))
     if threshold_MPa == 0 or not known:
-        return Adjustment(kept, np.zeros(len(raw)), threshold_MPa, 0.0, tuple(reasons), segments)
-    mean = float(np.mean(known))
-    shift = np.array([0.0 if value is None else mean - value for value in at_threshold])
+        return Adjustment(curves, shift, threshold_MPa, 0.0, reasons, segments)
+    mean = float(np.mean(list(known.values())))
+    for i, strain in known.items():
+        shift[i] = mean - strain
     adjusted = tuple(
         None if curve is None else _through(curve, offset, threshold_MPa, mean)
-        for curve, offset in zip(kept, shift, strict=True)
+        for curve, offset in zip(curves, shift, strict=True)
     )
-    return Adjustment(adjusted, shift, threshold_MPa, mean, tuple(reasons), segments)
+    return Adjustment(adjusted, shift, threshold_MPa, mean, reasons, segments)
 
 
 def _through(curve: LoadingCurve, offset: float, threshold_MPa: float, strain: float) -> LoadingCurve:
@@ -214,3 +217,95 @@ def _why_not(
     third = max(len(strain) // 3, 1)
     rise = float(strain[-third:].mean() - strain[:third].mean())
     return None if rise > 0 else no_climb(rise * effective_diameter_um(diameters_um))
+
+
+def _reason(sentence: str, remedy: str) -> Finding:
+    return Finding("usable", "error", sentence, remedy)
+
+
+def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarray, threshold_MPa: float) -> Finding:
+    """Why a test with these stresses [MPa], shape (n,), has no virgin loading; below the threshold nothing counts."""
+    force = curve.force_mN
+    low, high = float(force.min()), float(force.max())
+    column = "check that the right column is taken as force, or"
+    if not high > low:
+        return _reason(f"has one force throughout, {high:.4g} mN, so it never loads", f"{column} export the test again")
+    if np.abs(stress_MPa).max() <= threshold_MPa:
+        return below_threshold(float(stress_MPa.max()), threshold_MPa)
+    if -low > high:
+        what = f"is under load where its force is negative, down to {low:.4g} mN"
+        return _reason(what, "reverse the sign of force: compression must count as positive")
+    touching = [part.kind for part in segments if part.kind in ("load", "unload", "reload")]
+    if touching[:1] == ["unload"]:
+        what = f"begins at its largest force, {force[0]:.4g} mN (unloading only), so its loading is missing"
+        return _reason(what, "join the loading part of the test to it: some test machines store the two separately")
+    levels = np.unique(force)
+    if len(levels) <= FEW_FORCES:
+        what = f"has {len(levels)} different forces only, in steps of {np.diff(levels).min():.4g} mN"
+        return _reason(what, "export the force with more digits, or test with a finer load cell")
+    return _reason("has no loading: force never rises above its noise", f"{column} leave the particle out")
+
+
+def no_climb(rise_um: float) -> Finding:
+    """Why a test has no loading curve although it loads: its displacement does not grow, by `rise_um` [um]."""
+    if rise_um == 0:
+        what = "displacement stays the same while force grows"
+        remedy = "check that the right column is taken as displacement, or leave the particle out"
+    elif rise_um < 0:
+        what = f"displacement falls by {-rise_um:.3g} um while force grows"
+        remedy = "reverse the sign of displacement: it must grow as the platens approach each other"
+    else:
+        what = f"displacement grows with force by {rise_um:.3g} um only, not beyond its noise"
+        remedy = "check the unit and the column of displacement, or leave the particle out"
+    return _reason(f"shows no loading curve: {what}", remedy)
+
+
+def below_threshold(stress_MPa: float, threshold_MPa: float) -> Finding:
+    """Why a test is too weak: it reaches no more than `stress_MPa`."""
+    what = f"reaches {stress_MPa:.3g} MPa only, not the threshold of {threshold_MPa:g} MPa"
+    remedy = "check the unit of force and the diameters (they turn force into stress), or lower the threshold"
+    return _reason(what, remedy)
+
+
+def too_few(points: int, least: int) -> Finding:
+    """Why a loading curve is too short."""
+    what = f"has {points} usable points on loading, fewer than {least}"
+    return _reason(what, "record loading with more readings, or lower the threshold")
+
+
+def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]) -> list[Finding | None]:
+    """Which tests are in other units than the rest, by the largest stress of each particle and its range of
+    displacement over its effective diameter; None for those that are not used anyway."""
+    found: list[Finding | None] = [None] * len(stress_MPa)
+    weak = "reaches {:.3g} MPa where the others reach {:.3g} MPa"
+    short = "is compressed by {:.3g} of its size where the others are by {:.3g}"
+    for values, what, unit in (
+        (stress_MPa, weak, "force and its diameters (they turn force into stress)"),
+        (strain, short, "displacement and its diameters"),
+    ):
+        ordered = np.sort([value for value in values if value is not None])
+        for i, own in enumerate(values):
+            if own is None or len(ordered) < 2 or found[i] is not None:
+                continue
+            usual = median(np.delete(ordered, np.searchsorted(ordered, own)))
+            if not usual / FAR_APART <= own <= usual * FAR_APART:
+                found[i] = _reason(what.format(own, usual), f"check its unit of {unit}, or leave the particle out")
+    return found
+
+
+def refusal(campaign: Campaign, problem: str, reasons: Sequence[Finding | None]) -> InputError:
+    """The error that says why particles cannot be used, with every reason once, and what to do; reasons are None for
+    particles that can be used."""
+    groups: dict[Finding, list[str]] = {}
+    for name, reason in zip(campaign.particles, reasons, strict=True):
+        if reason is not None:
+            groups.setdefault(reason, []).append(repr(name))
+    parts, remedies = [], []
+    for reason, names in list(groups.items())[:SHOWN]:
+        more = ", ".join(names[1:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+        parts.append(f"particle {names[0]} {reason.sentence}" + (f" (likewise {more})" if more else ""))
+        remedies.append(reason.remedy[:1].upper() + reason.remedy[1:])
+    parts += ["..."] * (len(groups) > SHOWN)
+    remedy = ". ".join(dict.fromkeys(remedies))
+    problem, remedy = add_likely_unit_error(campaign, f"{problem}: {'; '.join(parts)}", remedy)
+    return InputError(problem, file=campaign.source or None, remedy=f"{remedy}.")

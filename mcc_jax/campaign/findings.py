@@ -18,11 +18,11 @@ class Finding:
     Attributes:
         check: what was checked, in two or three words: "zero of force", "saturation", "breakage", "plausibility",
             "fitted modulus".
-        level: "info" where the data allowed it to be settled (corrected, or readings left out), "warning" where the
-            numbers are to be used with care, "error" where they are not to be trusted before it is settled.
-        sentence: what was found and what was done about it; one sentence, without its full stop. Of a single test it
-            has `{}` in place of its numbers.
-        remedy: what a person can do; one sentence without its full stop, empty where nothing need be done.
+        level: "info" where it was settled (corrected, or readings left out), "warning" where the numbers are to be used
+            with care, "error" where they are not to be trusted before it is settled.
+        sentence: what was found and what was done about it, without its full stop. Of a single test it has `{}` in
+            place of its numbers.
+        remedy: what a person can do, without its full stop; empty where nothing need be done.
         particles: names of the particles concerned; empty where it concerns the whole campaign.
         code: what was found, for programs that decide by it; not in files.
         numbers: of a single test, one for each `{}`; not in files.
@@ -63,9 +63,8 @@ class Finding:
 
 def worst(findings: Iterable[Finding]) -> Level | None:
     """The most serious level among findings, None where there are none."""
-    levels = {one.level for one in findings}
-    order: tuple[Level, ...] = ("error", "warning", "info")
-    return next((level for level in order if level in levels), None)
+    order: tuple[Level, ...] = ("info", "warning", "error")
+    return max((one.level for one in findings), key=order.index, default=None)
 
 
 def named(names: tuple[str, ...], of: int, most: int = 5) -> str:
@@ -77,23 +76,15 @@ def named(names: tuple[str, ...], of: int, most: int = 5) -> str:
 
 
 def joined(each: Mapping[str, Iterable[Finding]]) -> tuple[Finding, ...]:
-    """One finding for all tests in which the same was found, with the ranges of their numbers.
-
-    Args:
-        each: what was found in each test, by the name of its particle.
-    """
+    """One finding, with ranges of its numbers, for all tests of the same fault; by the names of their particles."""
     groups: dict[Finding, dict[str, tuple[float | int, ...]]] = {}
     for name, found in each.items():
         for one in found:
             groups.setdefault(one.of(), {})[name] = one.numbers
     together = []
     for one, numbers in groups.items():
-        texts = [_range(column) for column in zip(*numbers.values(), strict=True)]
+        ends = [(f"{min(values):.4g}", f"{max(values):.4g}") for values in zip(*numbers.values(), strict=True)]
+        texts = [low if low == high else f"{low} to {high}" for low, high in ends]
         sentence = f"{named(tuple(numbers), len(each))}: {one.sentence.format(*texts)}"
         together.append(replace(one, sentence=sentence, particles=tuple(numbers)))
     return tuple(together)
-
-
-def _range(values: tuple[float | int, ...]) -> str:
-    low, high = f"{min(values):.4g}", f"{max(values):.4g}"
-    return low if low == high else f"{low} to {high}"

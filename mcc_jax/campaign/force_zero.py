@@ -11,7 +11,7 @@ import numpy as np
 from .findings import Finding
 from .schema import Campaign, Control, Curve
 from .segments import contact_index, find_segments
-from .signal import Line, differences, median, point_noise, two_lines
+from .signal import Line, median, point_noise, two_lines
 
 AIR_READINGS = 5  # before contact, at least: fewer do not give the zero's error
 AIR_SAID = 3.0  # standard deviations from which on an offset is reported
@@ -21,7 +21,6 @@ DRIFT_SLOWER = 0.1  # of loading's slope: a straight rise before loading is a dr
 DRIFT_LIKE = 0.7  # up to this share it may be one, and is reported; first contact of asperities is not straight
 OTHER_STIFFNESS = 1.5  # factor in force over displacement; with less, only the speed of the test machine changed
 START_SHARE = 0.1  # of the largest force, up to which a drift is looked for: no preload is larger, and loading bends
-
 
 CHECK = "zero of force"
 OFFSET = Finding(CHECK, "info", "force reads {} mN before contact; this was taken off", code="offset")
@@ -57,13 +56,13 @@ OPEN = Finding(
 
 
 class ZeroOfForce(NamedTuple):
-    """What the force channel reads without contact: what to take off at each reading, constant from contact on; the
-    zero at contact and its standard deviation [mN]; and what was found."""
+    """What to take off at each reading, one number or shape (n,); the zero at contact and its standard deviation [mN];
+    and what was found."""
 
-    path: np.ndarray
+    path: np.ndarray | float
     value: float
     sd: float
-    findings: tuple[Finding, ...] = ()
+    finding: Finding | None
 
 
 def zero_of_force(
@@ -71,57 +70,51 @@ def zero_of_force(
 ) -> ZeroOfForce | None:
     """The force that is read before contact; None if nothing shows another zero than the file's own.
 
-    Without a drift it is the readings' mean, with the error of a mean of autocorrelated readings (as of an
-    autoregressive process of order 1). With a drift it is their straight line over time up to contact, and the line's
-    value there from then on; what the drift did during the test nobody knows, so its change before contact is the
-    error. Without readings before contact, a record that begins far from zero is reported.
+    Without a drift it is the readings' mean, with the error of a mean of autocorrelated readings. With a drift it is
+    their line over time up to contact, and its value there from then on; what the drift did during the test nobody
+    knows, so its change before contact is the error. Without readings before contact, see `_begins_elsewhere`.
     """
     contact, ahead = air_until(curve, control)
+    least = AIR_SHARE * float(np.ptp(curve.force_mN))
     if contact is None:
         # A rise before loading that is too quick to be taken for a drift, and too straight for a contact.
-        if ahead is not None and abs(ahead.change) > AIR_SHARE * float(np.ptp(curve.force_mN)):
-            return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (PERHAPS_DRIFT.of(ahead.change),))
-        return _begins_elsewhere(curve, zero_mN)
+        if ahead is not None and abs(ahead.change) > least:
+            return ZeroOfForce(0.0, 0.0, 0.0, PERHAPS_DRIFT.of(ahead.change))
+        return _begins_elsewhere(curve, zero_mN, least)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(AIR_READINGS, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
     mean, sd, line = float(np.mean(air)), float(np.std(air, ddof=1)), Line.through(when, air)
-    largest = max(float(np.max(curve.force_mN) - mean), 1e-300)
+    least = AIR_SHARE * max(float(np.max(curve.force_mN) - mean), 1e-300)
     error = 0.0
     if sd > 0 and line.spread > 0:
-        change = line.slope * float(when[-1] - when[0])
-        drifts = abs(line.slope) > DRIFT_SAID * line.slope_sd * _inflation(line.left)
-        if drifts and abs(change) > AIR_SHARE * largest:
+        change = abs(line.slope * float(when[-1] - when[0]))
+        if abs(line.slope) > DRIFT_SAID * line.slope_sd * _inflation(line.left) and change > least:
             path = line.at(np.minimum(curve.time_s, curve.time_s[contact - 1]))
-            error = float(np.hypot(line.sd / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
-            return ZeroOfForce(path, float(path[-1]), error, (DRIFT.of(abs(change), float(path[-1])),))
+            error = float(np.hypot(line.sd / np.sqrt(len(air)), change / np.sqrt(12)))
+            return ZeroOfForce(path, float(path[-1]), error, DRIFT.of(change, float(path[-1])))
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
-    said = abs(mean) > AIR_SAID * error and abs(mean) > AIR_SHARE * largest
-    return ZeroOfForce(np.full(len(curve), mean), mean, error, (OFFSET.of(mean),) if said else ())
+    said = abs(mean) > max(AIR_SAID * error, least)
+    return ZeroOfForce(mean, mean, error, OFFSET.of(mean) if said else None)
 
 
 def open_zero(campaign: Campaign) -> tuple[float, float] | None:
     """The zero of force [mN] and its error, if checked tests were not tared of which some may have been preloaded."""
-    zero = _one_zero(campaign.curves, OPEN)
+    zero = shared_zero(campaign.curves, OPEN)
     return zero if zero is not None and zero[0] > 0 else None
 
 
-def untared_zero(curves: Sequence[Curve]) -> tuple[float, float] | None:
-    """The zero of force [mN] and its error, if checked tests begin below zero which one load cell explains."""
-    return _one_zero(curves, NOT_TARED)
+def shared_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float] | None:
+    """The zero that all checked tests share, and its error [mN]; None if they share none, or none has this finding.
 
-
-def _one_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float] | None:
-    """The zero that all tests share, and its error [mN]; None if they share none, or none has this finding.
-
-    One load cell has one zero, and nothing pulled: every test begins within a step of its ramp above it. The line of
-    first readings over first steps, weighted by the step, meets the zero where the step is nil; of fewer than three
-    tests the lowest reading is taken, which may be any part of its step beyond contact.
+    Every test of one load cell begins within a step of its ramp above its zero: the line of first readings over first
+    steps, weighted by the step, meets the zero where the step is nil. Of fewer than three tests the lowest reading is
+    taken, which may be any part of its step beyond contact.
     """
-    found = (one.code for curve in curves if curve.checked is not None for one in curve.checked.findings)
-    if needed.code not in found:
+    checked = [curve.checked for curve in curves]
+    if all(one.code != needed.code for each in checked if each is not None for one in each.findings):
         return None
-    taken_off = (0.0 if curve.checked is None else curve.checked.force_zero_mN for curve in curves)
+    taken_off = [0.0 if one is None else one.force_zero_mN for one in checked]
     begins = np.array([curve.force_mN[0] + off for curve, off in zip(curves, taken_off, strict=True)])
     steps = np.array([_first_steps(curve) for curve in curves])
     noise = max(point_noise(curve.force_mN) for curve in curves)
@@ -131,66 +124,41 @@ def _one_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float] |
         line = Line.through(1 / steps, begins / steps)
         if line.spread > 0 and line.slope_sd < error and line.slope <= zero:
             zero, error = line.slope, max(line.slope_sd, noise / np.sqrt(len(steps)))
-    together = np.all(begins - zero <= steps + AIR_SAID * noise)
-    return (zero, error) if together else None
+    return (zero, error) if np.all(begins - zero <= steps + AIR_SAID * noise) else None
 
 
 def _first_steps(curve: Curve) -> float:
     """By how much force grows from one reading to the next where a record begins [mN]."""
-    return median(np.abs(differences(curve.force_mN[: AIR_READINGS + 1])))
+    return median(np.abs(np.diff(curve.force_mN[: AIR_READINGS + 1])))
 
 
-def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None) -> ZeroOfForce | None:
+def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None, least: float) -> ZeroOfForce | None:
     """A record in contact whose first reading is below zero, or more than a step of the ramp above it.
 
-    One that begins above `START_SHARE` of its largest force has lost its loading, and shows no zero at all. Below zero
-    the load cell was not tared: the reading is taken off, and its error is as large as itself, unless all tests share a
-    zero, which is known better. Above it, that and a preload look alike, and the file's zero stays.
+    Below zero the load cell was not tared: the reading is taken off, and its error is as large as itself, unless all
+    tests share a zero, which is known better. Above it, that and a preload look alike, and the file's zero stays. One
+    that begins above `START_SHARE` of its largest force has lost its loading, and shows no zero at all.
     """
     first = float(curve.force_mN[0])
     if zero_mN is not None:
         zero, error = zero_mN
-        found = (NOT_TARED.of(first, zero),) if zero < 0 else ()
-        return ZeroOfForce(np.full(len(curve), zero), zero, error, found)
-    step = _first_steps(curve)
-    least = max(AIR_SHARE * float(np.ptp(curve.force_mN)), AIR_SAID * point_noise(curve.force_mN))
-    if -least <= first <= step + least or abs(first) > START_SHARE * float(curve.force_mN.max()):
+        return ZeroOfForce(zero, zero, error, NOT_TARED.of(first, zero) if zero < 0 else None)
+    least = max(least, AIR_SAID * point_noise(curve.force_mN))
+    if -least <= first <= _first_steps(curve) + least or abs(first) > START_SHARE * float(curve.force_mN.max()):
         return None
     if first < 0:
-        return ZeroOfForce(np.full(len(curve), first), first, -first, (NOT_TARED.of(first, first),))
-    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (OPEN.of(first),))
+        return ZeroOfForce(first, first, -first, NOT_TARED.of(first, first))
+    return ZeroOfForce(0.0, 0.0, 0.0, OPEN.of(first))
 
 
 def _inflation(scatter: np.ndarray) -> float:
     """How much larger the error of a mean of autocorrelated readings is, by their lag-1 correlation."""
-    lag = min(max(float(scatter[1:] @ scatter[:-1] / max(scatter @ scatter, 1e-300)), 0.0), 0.9)
+    lag = np.clip(float(scatter[1:] @ scatter[:-1] / max(scatter @ scatter, 1e-300)), 0.0, 0.9)
     return float(np.sqrt((1 + lag) / (1 - lag)))
 
 
-def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowStart | None]:
-    """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
-
-    The approach of `find_segments`; where it finds none, a straight and much slower rise before loading is a drift of
-    the load cell, and the approach is looked for again without it.
-    """
-
-    def found(curve: Curve) -> int | None:
-        contact = contact_index(find_segments(curve, control=control))
-        return contact if contact > AIR_READINGS else None
-
-    contact = found(curve)
-    if contact is not None:
-        return contact, None
-    ahead = slow_start(curve)
-    if ahead is None or ahead.share > DRIFT_SLOWER:
-        return None, ahead
-    time = np.minimum(curve.time_s, curve.time_s[ahead.stop - 1])
-    return found(replace(curve, force_mN=curve.force_mN - ahead.line.at(time))), ahead
-
-
 class SlowStart(NamedTuple):
-    """A straight course of force over time before loading: how many readings it has, the change of force along it [mN],
-    and its slope as a share of the loading's."""
+    """A straight course of force before loading, its readings, its change [mN], and its share of loading's slope."""
 
     line: Line
     stop: int
@@ -198,10 +166,26 @@ class SlowStart(NamedTuple):
     share: float
 
 
+def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowStart | None]:
+    """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
+
+    Where `find_segments` finds no approach, it is looked for again without a straight and much slower rise, a drift.
+    """
+    contact = contact_index(find_segments(curve, control=control))
+    if contact > AIR_READINGS:
+        return contact, None
+    ahead = slow_start(curve)
+    if ahead is None or ahead.share > DRIFT_SLOWER:
+        return None, ahead
+    drift = ahead.line.at(np.minimum(curve.time_s, curve.time_s[ahead.stop - 1]))
+    contact = contact_index(find_segments(replace(curve, force_mN=curve.force_mN - drift), control=control))
+    return (contact if contact > AIR_READINGS else None), ahead
+
+
 def slow_start(curve: Curve) -> SlowStart | None:
     """A straight and slower course of force before loading, of a load cell that drifts; None without one.
 
-    A slower speed of the test machine bends force and displacement alike: it is none.
+    A slower speed of the test machine, which bends force and displacement alike, is none.
     """
     force, time, path = curve.force_mN, curve.time_s, curve.displacement_um
     first = int(np.argmax(force > force[0] + START_SHARE * (force.max() - force[0])))
@@ -217,10 +201,9 @@ def slow_start(curve: Curve) -> SlowStart | None:
     way, on = (Line.through(time[rows], path[rows]).slope for rows in (ahead, behind))
     error = point_noise(force) * np.sqrt(1 / slow.spread + 1 / fast.spread)
     share, pace = slow.slope / max(fast.slope, 1e-300), way / max(on, 1e-300)
-    if fast.slope - slow.slope <= DRIFT_SAID * error or share > DRIFT_LIKE:
-        return None
-    if pace > 0 and share > 0 and 1 / OTHER_STIFFNESS < share / pace < OTHER_STIFFNESS:
-        return None
-    if np.std(slow.left) > 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force)):
+    distinct = fast.slope - slow.slope > DRIFT_SAID * error and share <= DRIFT_LIKE
+    only_slower = pace > 0 and share > 0 and 1 / OTHER_STIFFNESS < share / pace < OTHER_STIFFNESS
+    straight = np.std(slow.left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
+    if not distinct or only_slower or not straight:
         return None
     return SlowStart(slow, kink, slow.slope * float(time[kink - 1] - time[0]), share)

@@ -5,13 +5,9 @@ Every hypothesis is judged by the same wide ranges: the numbers as given, and th
 against "as given" are the difference of the log densities plus its prior log odds (a Bayes factor).
 
 What cannot be seen: a factor that leaves everything within the ranges. Loading, unloading and their ratio say the same
-of a sphere of half the size with a modulus 1.4 times as large; radii given for diameters show only where the platens
-would have come closer than the particle allows, in tests of cellulose to 5 MPa and more. Forces of cellulose in uN
-taken for mN are those of a strong metal where tests end below 3 MPa. Times show only where they are far from any
-test's.
-
-A fitted modulus points to no unit: a wrong one moves it and the records' own stiffness by the same factor (both go as
-force / (displacement^1.5 diameter^0.5)), so where the records are ordinary, the form of the law is at fault.
+of a sphere of half the size with a modulus 1.4 times as large: radii given for diameters show only where the platens
+would have touched. A fitted modulus points to no unit: a wrong one moves it and the records' own stiffness by the same
+factor (both go as force / (displacement^1.5 diameter^0.5)).
 """
 
 from __future__ import annotations
@@ -22,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .curve_features import CurveFeatures, curve_features
-from .findings import Finding, worst
+from .findings import Finding, Level, worst
 from .paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from .schema import Campaign, Curve, remembered
 from .unit_errors import (
@@ -33,10 +28,13 @@ from .unit_errors import (
     LOADING_S,
     SOLIDS,
     UNIT_ERROR,
+    CurveFeatures,
     Range,
     UnitError,
     apparent,
     beyond,
+    closure,
+    curve_features,
     hypotheses,
     in_words,
     is_radius,
@@ -46,7 +44,6 @@ from .unit_errors import (
 )
 from .validate import check_campaign
 
-CHECK = "plausibility"
 ODDS = 3.0  # log odds from which on an error is reported: 20 to 1
 ALIKE = 1.0  # log odds within which a second hypothesis is named, too
 GROUP = 0.25  # share of the tests that have an error in common, of another instrument or another person
@@ -60,6 +57,7 @@ STIFFER = 3.0
 the law's particles scatter by 1.35."""
 
 
+@np.errstate(all="ignore")
 def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) -> tuple[Finding, ...]:
     """Report what a wrong unit, sign or column would explain in a campaign.
 
@@ -75,27 +73,29 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
     """
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
-    found = _diagnose(campaign.raw or campaign)
-    if found.typical is None or worst(found.findings) == "error":
-        return found.findings
-    return (*found.findings, *_fitted_modulus(found.typical, modulus_MPa), *found.remark)
+    tests = _tests(campaign)
+    if not tests.names or worst(tests.findings) == "error":
+        return tests.findings
+    fitted = _fitted_modulus(_typical(tests.numbers), modulus_MPa)
+    material = None if tests.findings else _material(tests)
+    return (*tests.findings, *fitted, *([] if material is None else [material.remark]))
 
 
 class Material(NamedTuple):
-    """How stiff a material is compared with micro-crystalline cellulose: the ratio of stresses at the same strain in
-    decades, the median peak stress, and the median strain there, scaled with the paper's shape factor."""
+    """Another material than micro-crystalline cellulose: median peak stress, strain there times the paper's shape
+    factor, and a remark that it is stiffer or softer."""
 
-    decades: float
     stress_MPa: float
     strain: float
+    remark: Finding
 
 
+@np.errstate(all="ignore")
 def other_material(campaign: Campaign) -> Material | None:
-    """How much stiffer or softer than micro-crystalline cellulose the tests are; None if they are like it, or if a
-    wrong unit or sign is more likely."""
-    check_campaign(campaign)
-    found = _diagnose(campaign.raw or campaign)
-    return None if worst(found.findings) == "error" else found.material
+    """The material of the tests; None if they are like micro-crystalline cellulose, or a wrong unit or sign is more
+    likely."""
+    tests = _tests(check_campaign(campaign))
+    return None if not tests.names or worst(tests.findings) == "error" else _material(tests)
 
 
 def add_likely_unit_error(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
@@ -107,49 +107,21 @@ def add_likely_unit_error(campaign: Campaign, problem: str, remedy: str) -> tupl
 
 def wrong_signs(campaign: Campaign) -> bool:
     """Whether force, displacement or both are counted the other way round in most tests of a campaign."""
-    tests = _Tests(campaign)
-    turned = (tests.column("force_sign") < 0) | (tests.column("displacement_sign") < 0)
+    features = _tests(campaign).features
+    turned = (features.force_sign < 0) | (features.displacement_sign < 0)
     return 2 * int(turned.sum()) > len(turned)
 
 
-class _Diagnosis(NamedTuple):
-    """What a campaign shows before any fit: findings, and, where its tests show anything, median numbers of theirs as
-    `log_numbers` gives them, how its material differs from cellulose, and a remark on it if nothing else was found."""
-
-    findings: tuple[Finding, ...] = ()
-    typical: np.ndarray | None = None
-    material: Material | None = None
-    remark: tuple[Finding, ...] = ()
-
-
-def _diagnose(campaign: Campaign) -> _Diagnosis:
-    """The same for every question about a campaign, so worked out once."""
-
-    def find() -> _Diagnosis:
-        with np.errstate(all="ignore"):
-            tests = _Tests(campaign)
-            if not tests.names:
-                return _Diagnosis()
-            units = _units(tests)
-            found = [*_signs(tests), *(units or _outside(tests)), *_clock(tests)]
-            if not units:  # one diameter in another unit is out of order, too
-                found += _order_of_diameters(tests)
-            material, remark = _material(tests)
-            return _Diagnosis(tuple(found), _typical(tests.numbers), material, () if found else remark)
-
-    return remembered(campaign, "diagnosis", find)
-
-
 class _Tests:
-    """The tests of a campaign that show anything: names, sizes and features."""
+    """The tests of a campaign that show anything: names, sizes, features, and what they let conclude."""
 
     def __init__(self, campaign: Campaign) -> None:
         sizes = np.asarray(campaign.diameters_um, float)
-        features = [_features(curve) for curve in campaign.curves]
-        known = (np.isfinite(sizes) & (sizes > 0)).all(axis=1).tolist()
-        rows = [i for i, (one, good) in enumerate(zip(features, known, strict=True)) if one is not None and good]
+        known = (np.isfinite(sizes) & (sizes > 0)).all(axis=1)
+        rows = [i for i, curve in enumerate(campaign.curves) if known[i] and _features(curve) is not None]
         self.names, self.diameters_um = [campaign.particles[i] for i in rows], sizes[rows]
-        self.features, self.curves = [features[i] for i in rows], [campaign.curves[i] for i in rows]
+        self.curves = [campaign.curves[i] for i in rows]
+        self.features = _columns([_features(curve) for curve in self.curves])
 
     @cached_property
     def numbers(self) -> np.ndarray:
@@ -157,16 +129,24 @@ class _Tests:
         return log_numbers(self.features, self.diameters_um)
 
     @cached_property
-    def swapped(self) -> np.ndarray:
-        """The same with force and displacement exchanged."""
-        return log_numbers([_features(curve, swapped=True) for curve in self.curves], self.diameters_um)
-
-    def column(self, name: str) -> np.ndarray:
-        return np.array([getattr(one, name) for one in self.features], float)
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with them."""
+        if not self.names:
+            return ()
+        units = _units(self)
+        found = [*_signs(self), *(units or _outside(self)), *_clock(self.features)]
+        if not units:  # one diameter in another unit is out of order, too
+            found += _order_of_diameters(self.diameters_um)
+        return tuple(found)
 
     def some(self, chosen: np.ndarray) -> tuple[str, ...]:
         """Names of the chosen tests, none where all are."""
         return () if chosen.all() else tuple(n for n, c in zip(self.names, chosen, strict=True) if c)
+
+
+def _tests(campaign: Campaign) -> _Tests:
+    raw = campaign.raw or campaign
+    return remembered(raw, "tests", lambda: _Tests(raw))
 
 
 def _features(curve: Curve, *, swapped: bool = False) -> CurveFeatures | None:
@@ -174,14 +154,23 @@ def _features(curve: Curve, *, swapped: bool = False) -> CurveFeatures | None:
     return remembered(curve, ("features", swapped), lambda: curve_features(curve.time_s, *columns))
 
 
-# ---- units, and columns swapped --------------------------------------------------------------------------------------
+def _columns(tests: Sequence[CurveFeatures | None]) -> CurveFeatures:
+    """Features of several tests as arrays, NaN for a test without any."""
+    unknown = (np.nan,) * len(CurveFeatures._fields)
+    rows = np.array([unknown if one is None else one for one in tests], float)
+    return CurveFeatures(*rows.reshape(-1, len(unknown)).T)
+
+
+def _finding(sentence: str, remedy: str, names: tuple[str, ...] = (), level: Level = "error") -> Finding:
+    return Finding("plausibility", level, sentence[0].upper() + sentence[1:], remedy[:1].upper() + remedy[1:], names)
 
 
 def _units(tests: _Tests) -> list[Finding]:
     """Wrong units and swapped columns, of the whole campaign, of a group of its tests and of single particles."""
     errors = hypotheses()
     prior = np.array([one.prior for one in errors])
-    undone = undo(tests.numbers, tests.swapped, errors)
+    swapped = log_numbers(_columns([_features(curve, swapped=True) for curve in tests.curves]), tests.diameters_um)
+    undone = undo(tests.numbers, swapped, errors)
     odds = log_density(undone) + prior
     whole = np.median(odds, axis=0)
     found = []
@@ -196,7 +185,7 @@ def _units(tests: _Tests) -> list[Finding]:
         corrected[group] = undone[group, np.argmax(total)]
         settled |= group
     if len(tests.names) >= 4:
-        single = _unlike_the_others(undo(corrected, tests.swapped, errors), corrected)
+        single = _unlike_the_others(undo(corrected, swapped, errors), corrected)
         # One soft particle may come close to flat; radii show only in what all of them do.
         single += np.where([is_radius(one) for one in errors], -np.inf, prior)
         groups = [group & ~settled for group in _agreeing(single)]
@@ -215,7 +204,7 @@ def _unlike_the_others(undone: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
     def compared(numbers: np.ndarray) -> np.ndarray:
         it = apparent(numbers)
-        return np.concatenate([numbers[..., 2:5], it.strain[..., None], it.loading_modulus[..., None]], axis=-1)
+        return np.concatenate([numbers[..., 2:5], it.strain[..., None], it.loading_modulus_MPa[..., None]], axis=-1)
 
     values = compared(numbers)
     centre = _typical(values)
@@ -238,71 +227,60 @@ def _unit_finding(tests: _Tests, errors: Sequence[UnitError], odds: np.ndarray, 
     names = tests.some(concerned)
     numbers = _typical(tests.numbers[concerned])
     it = apparent(numbers)
-    modulus = it.modulus if np.isfinite(it.modulus) else it.loading_modulus
+    modulus = it.modulus_MPa if np.isfinite(it.modulus_MPa) else it.loading_modulus_MPa
+    reached = f"{_number(it.stress_MPa)} MPa at a strain of {_number(it.strain)} with a modulus of {_modulus(modulus)}"
+    sizes = f"diameters of {_number(numbers[2:5].mean())} um"
     sentence = (
-        f"{likely}: as given, {_who(names, 'the tests')} reach{'es' if len(names) == 1 else ''} {_number(it.stress)}"
-        f" MPa at a strain of {_number(it.strain)} with a modulus of {_modulus(modulus)} and diameters of"
-        f" {_number(numbers[2:5].mean())} um, which fits {'neither the others nor any' if names else 'no'} usual solid"
+        f"{likely}: as given, {_who(names, 'the tests')} reach{'es' if len(names) == 1 else ''} {reached} and {sizes},"
+        f" which fits {'neither the others nor any' if names else 'no'} usual solid"
     )
-    return Finding(CHECK, "error", _capital(sentence), _capital(remedy), names)
-
-
-# ---- signs, times, order of diameters --------------------------------------------------------------------------------
-
-
-HEADERS = {"force": "force_mN", "displacement": "displacement_um"}
+    return _finding(sentence, remedy, names)
 
 
 def _signs(tests: _Tests) -> list[Finding]:
     """Forces or displacements that are negative in compression."""
-    force, displacement = tests.column("force_sign") < 0, tests.column("displacement_sign") < 0
-    heights = np.log10(tests.column("force_mN"))
-    # A record without a particle has a sign, too.
-    real = heights > _median(heights) - 1.5
-    kinds = (
-        (force & displacement, ("force", "displacement"), "both go below zero as the load rises"),
-        (force & ~displacement, ("force",), "the load rises as the force falls below zero"),
-        (~force & displacement, ("displacement",), "the displacement falls as the force rises"),
-    )
+    force, displacement = tests.features.force_sign < 0, tests.features.displacement_sign < 0
+    heights = np.log10(tests.features.force_mN)
+    real = heights > _median(heights) - 1.5  # a record without a particle has a sign, too
     found = []
-    for turned, columns, seen in kinds:
+    for turned, columns, seen in (
+        (force & displacement, ("force_mN", "displacement_um"), "both go below zero as the load rises"),
+        (force & ~displacement, ("force_mN",), "the load rises as the force falls below zero"),
+        (~force & displacement, ("displacement_um",), "the displacement falls as the force rises"),
+    ):
         if not (real & turned).any():
             continue
         names = tests.some(real & turned)
-        what, headers = " and ".join(f"{one}s" for one in columns), " and ".join(HEADERS[one] for one in columns)
-        sentence = (
-            f"The {what} of {_who(names)} seem to have the wrong sign: {seen}, and compression counts positive here"
+        channels = [column.partition("_")[0] for column in columns]
+        what = f"{' and '.join(f'{channel}s' for channel in channels)} of {_who(names)}"
+        remedy = f"turn the sign of {' and '.join(columns)} in curves.csv, or write sign = -1 for"
+        found.append(
+            _finding(
+                f"the {what} seem to have the wrong sign: {seen}, and compression counts positive here",
+                f"{remedy} {' and '.join(channels)} in the mapping file",
+                names,
+            )
         )
-        remedy = (
-            f"Turn the sign of {headers} in curves.csv, or write sign = -1 for {' and '.join(columns)} in the mapping"
-            " file"
-        )
-        found.append(Finding(CHECK, "error", sentence, remedy, names))
     return found
 
 
-def _clock(tests: _Tests) -> list[Finding]:
+def _clock(features: CurveFeatures) -> list[Finding]:
     """Times in a wrong unit."""
-    loading, interval = np.log10(tests.column("loading_s")), np.log10(tests.column("interval_s"))
-    shifts = np.array([one.decades[-1] for one in CLOCKS])
-    density = -beyond(loading[:, None] + shifts, np.log10(LOADING_S))
-    density = density - beyond(interval[:, None] + shifts, np.log10(INTERVAL_S))
-    density = np.where(np.isfinite(loading)[:, None], density, 0.0)
-    odds = np.median(density, axis=0) + np.array([one.prior for one in CLOCKS])
+    loading, interval = np.log10(features.loading_s)[:, None], np.log10(features.interval_s)[:, None]
+    shifts, prior = np.array([(one.decades[-1], one.prior) for one in CLOCKS]).T
+    outside = beyond(loading + shifts, np.log10(LOADING_S)) + beyond(interval + shifts, np.log10(INTERVAL_S))
+    odds = np.median(np.where(np.isfinite(loading), -outside, 0.0), axis=0) + prior
     best = int(np.argmax(odds))
     if best == 0 or odds[best] < odds[0] + ODDS:
         return []
     likely, remedy = in_words(CLOCKS[best])
-    sentence = (
-        f"{likely}: as given, loading takes {_number(_median(loading))} s with a reading every"
-        f" {_number(_median(interval))} s"
-    )
-    return [Finding(CHECK, "error", _capital(sentence), _capital(remedy))]
+    pace = f"loading takes {_number(_median(loading))} s with a reading every {_number(_median(interval))} s"
+    return [_finding(f"{likely}: as given, {pace}", remedy)]
 
 
-def _order_of_diameters(tests: _Tests) -> list[Finding]:
+def _order_of_diameters(diameters_um: np.ndarray) -> list[Finding]:
     """D3 in a column of another diameter: particles rest on their flat side, so D3 is the smallest of most."""
-    sizes = np.unique(tests.diameters_um, axis=0)
+    sizes = np.unique(diameters_um, axis=0)
     sizes = sizes[sizes.max(axis=1) > 1.03 * sizes.min(axis=1)]
     if len(sizes) < 3:
         return []
@@ -313,46 +291,39 @@ def _order_of_diameters(tests: _Tests) -> list[Finding]:
     best = int(np.argmax(odds))
     if odds[best] < ODDS:
         return []
-    smallest = (ranks == 0).sum(axis=0)
+    smallest, other = (ranks == 0).sum(axis=0), f"D{best + 1}"
     sentence = (
-        f"The diameters D{best + 1} and D3 seem to be swapped: D{best + 1} is the smallest of {smallest[best]} of"
+        f"the diameters {other} and D3 seem to be swapped: {other} is the smallest of {smallest[best]} of"
         f" {len(sizes)} particles and D3 of {smallest[2]}, and particles rest on their flat side"
     )
-    remedy = (
-        f"D3 is the diameter along the compression; exchange D{best + 1}_um and D3_um in particles.csv, unless the"
-        " particles stood upright"
-    )
-    return [Finding(CHECK, "error", sentence, remedy)]
-
-
-# ---- numbers that no solid has, and other materials ------------------------------------------------------------------
+    exchange = f"exchange {other}_um and D3_um in particles.csv, unless the particles stood upright"
+    return [_finding(sentence, f"D3 is the diameter along the compression; {exchange}")]
 
 
 def _outside(tests: _Tests) -> list[Finding]:
     """Numbers beyond every range though no unit error explains them."""
     found: list[Finding] = []
-    closed = apparent(tests.numbers).closure > 0
+    closed = closure(tests.numbers) > 0
     if closed.any():
         names = tests.some(closed)
-        sentence = f"The displacement of {_who(names)} exceeds the diameter D3, so that the platens would have touched"
-        remedy = "Check the diameters and the zero of displacement"
-        found.append(Finding(CHECK, "warning" if names else "error", sentence, remedy, names))
+        sentence = f"the displacement of {_who(names)} exceeds the diameter D3, so that the platens would have touched"
+        remedy = "check the diameters and the zero of displacement"
+        found.append(_finding(sentence, remedy, names, "warning" if names else "error"))
     numbers = _typical(tests.numbers)
     it = apparent(numbers)
-    hulls = (
+    for what, unit, value, (low, high) in (
         ("diameter", "um", numbers[2:5].mean(), DIAMETER_UM),
-        ("stress", "MPa", it.stress, _hull("stress_MPa")),
-        ("stiffness of loading", "MPa", it.loading_modulus, _hull("loading_modulus_MPa")),
-        ("modulus of unloading", "MPa", it.modulus, _hull("modulus_MPa")),
-    )
-    for what, unit, value, (low, high) in hulls:
+        ("stress", "MPa", it.stress_MPa, _hull("stress_MPa")),
+        ("stiffness of loading", "MPa", it.loading_modulus_MPa, _hull("loading_modulus_MPa")),
+        ("modulus of unloading", "MPa", it.modulus_MPa, _hull("modulus_MPa")),
+    ):
         if value < np.log10(low / BEYOND) or value > np.log10(high * BEYOND):
             sentence = (
-                f"A typical {what} of {_number(value)} {unit} is outside the range of any solid between platens"
+                f"a typical {what} of {_number(value)} {unit} is outside the range of any solid between platens"
                 f" ({low:g} to {high:g} {unit}), and no single unit error explains it"
             )
-            remedy = "Check the units of force, displacement and diameters, and that tests are of single particles"
-            return [*found, Finding(CHECK, "error", sentence, remedy)]
+            remedy = "check the units of force, displacement and diameters, and that tests are of single particles"
+            return [*found, _finding(sentence, remedy)]
     return found
 
 
@@ -362,11 +333,9 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
     if modulus_MPa is None or low / BEYOND <= modulus_MPa <= BEYOND * high:
         return []
     it = apparent(typical)
-    own = (
-        f"with about {_modulus(it.modulus)} by the slope of unloading"
-        if np.isfinite(it.modulus)
-        else f"as stiff in loading as an elastic sphere of {_modulus(it.loading_modulus)}"
-    )
+    own = f"as stiff in loading as an elastic sphere of {_modulus(it.loading_modulus_MPa)}"
+    if np.isfinite(it.modulus_MPa):
+        own = f"with about {_modulus(it.modulus_MPa)} by the slope of unloading"
     sentence = (
         f"The fitted modulus of {modulus_MPa / 1e3:.3g} GPa is outside the range of any solid ({low / 1e3:g} to"
         f" {high / 1e3:g} GPa), though the tests are those of an ordinary one, {own}"
@@ -375,32 +344,29 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
     return [Finding("fitted modulus", "error", sentence, remedy)]
 
 
-def _material(tests: _Tests) -> tuple[Material | None, tuple[Finding, ...]]:
-    """How the tests differ from micro-crystalline cellulose, with a remark on it, which points to no fault."""
+def _material(tests: _Tests) -> Material | None:
+    """The material of the tests if it is not like micro-crystalline cellulose, which is no fault."""
     D1, D2, D3 = tests.diameters_um.T
     it = apparent(tests.numbers)
     x = (1 + PAPER_SHAPE_PARAMETER * (1 - D3**2 / (D1 * D2))) * 10**it.strain
     C1, C3, C5 = (np.exp(PAPER_LOG_C[name][0]) for name in ("C1", "C3", "C5"))
-    ratios = it.stress - np.log10(C1 * x - (C3 * x) ** 3 + (C5 * x) ** 5)
-    ratio = _median(np.where(np.isfinite(tests.column("fullness")), ratios, np.nan))
+    ratios = it.stress_MPa - np.log10(C1 * x - (C3 * x) ** 3 + (C5 * x) ** 5)
+    ratio = _median(np.where(np.isfinite(tests.features.fullness), ratios, np.nan))
     if not abs(ratio) > np.log10(STIFFER):
-        return None, ()
-    sentence = (
-        f"The material is {_number(abs(ratio))} times {'stiffer' if ratio > 0 else 'softer'} in loading than"
-        f" micro-crystalline cellulose (Avicel PH-200): {_number(_median(it.stress))} MPa at a strain of"
-        f" {_number(_median(it.strain))}; a typical solid otherwise"
+        return None
+    stress, strain = _median(it.stress_MPa), _median(it.strain)
+    remark = (
+        f"the material is {_number(abs(ratio))} times {'stiffer' if ratio > 0 else 'softer'} in loading than"
+        f" micro-crystalline cellulose (Avicel PH-200): {_number(stress)} MPa at a strain of {_number(strain)}; a"
+        " typical solid otherwise"
     )
-    material = Material(ratio, float(10 ** _median(it.stress)), float(np.nanmedian(x)))
-    return material, (Finding(CHECK, "info", sentence),)
-
-
-# ---- numbers and words -----------------------------------------------------------------------------------------------
+    return Material(float(10**stress), float(np.nanmedian(x)), _finding(remark, "", level="info"))
 
 
 def _hull(name: str) -> Range:
     """The range of all classes of solids together."""
-    ranges = [getattr(solid, name) for solid in SOLIDS]
-    return min(low for low, _ in ranges), max(high for _, high in ranges)
+    lows, highs = zip(*(getattr(solid, name) for solid in SOLIDS), strict=True)
+    return min(lows), max(highs)
 
 
 def _median(values: np.ndarray) -> float:
@@ -419,10 +385,6 @@ def _who(names: Sequence[str], everyone: str = "all tests") -> str:
         return everyone
     more = f" and {len(names) - 6} more" if len(names) > 6 else ""
     return f"particle{'s' if len(names) > 1 else ''} {', '.join(names[:6])}{more}"
-
-
-def _capital(text: str) -> str:
-    return text[0].upper() + text[1:]
 
 
 def _number(decades: float | np.ndarray) -> str:

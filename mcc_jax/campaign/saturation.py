@@ -1,9 +1,8 @@
 """A channel at the end of its range: readings that repeat the extreme while the other channel goes on.
 
-Such readings are censored: the true value lies beyond. Displacement is what the law is compared in, so readings at the
-end of its range are simply not compared. Force is what the law is driven with, and its largest value decides the whole
-unloading: there the turning point is taken from what still moves. The loading curve below the end of the range, in the
-law's own form
+The true value lies beyond. Displacement is what the law is compared in, so its readings at the end of the range are not
+compared. Force is what the law is driven with, and its largest value decides the whole unloading: the loading curve
+below the end of the range, in the law's own form
 
 .. math:: F = k_1 x - k_3 x^3 + k_5 x^5, \\qquad x = (d - z) / D_e
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from .findings import Finding
 from .schema import Curve
-from .signal import Line, differences, point_noise, quantile, runs
+from .signal import Line, point_noise, quantile, runs
 
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
 COARSE = 3.0  # and this many times as many as the channel repeats elsewhere: a coarse read-out repeats every value
@@ -38,7 +37,6 @@ TRUSTED = 0.25
 """Share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped at 98, 95, 90
 and 85 % the intervals of the modulus hold the truth; farther on nobody has looked."""
 
-
 FORCE_RANGE = Finding(
     "saturation",
     "warning",
@@ -52,9 +50,7 @@ TURNING_POINT = replace(
     "and the turning point is taken from the displacement ({} +- {} mN)",
 )
 FAR_BEYOND = replace(
-    TURNING_POINT,
-    level="error",
-    sentence=f"{TURNING_POINT.sentence}, too far beyond the range to be relied on",
+    TURNING_POINT, level="error", sentence=f"{TURNING_POINT.sentence}, too far beyond the range to be relied on"
 )
 DISPLACEMENT_RANGE = Finding(
     "saturation",
@@ -67,8 +63,8 @@ DISPLACEMENT_RANGE = Finding(
 
 
 class CensoredForce(NamedTuple):
-    """A test whose force channel saturated: the readings below the end of the range, and one turning point, not to be
-    compared, for each stretch at it that goes beyond any displacement reached before."""
+    """A test without the readings at the end of the force channel's range, but for one turning point, not to be
+    compared, for each stretch of them that goes beyond any displacement reached before."""
 
     curve: Curve
     rows: np.ndarray  # of the given curve
@@ -79,47 +75,38 @@ class CensoredForce(NamedTuple):
 
 def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float) -> list[tuple[int, int]]:
     """Stretches [start, stop) at the largest value of a channel during which the other, of this noise, goes on."""
-    count = len(values)
-    if count < 12:
-        return []
     starts, stops = runs(values)
     last = values[starts] == values.max()
-    at_end = list(zip(starts[last].tolist(), stops[last].tolist(), strict=True))
     elsewhere = (stops - starts)[~last]
-    if not at_end or not len(elsewhere):
+    if len(values) < 12 or not len(elsewhere):
         return []
-    usual = quantile(elsewhere, 0.9)
-    moves = np.abs(differences(values))
+    at_end = list(zip(starts[last].tolist(), stops[last].tolist(), strict=True))
+    least = max(REPEATS, COARSE * quantile(elsewhere, 0.9))
+    moves = np.abs(np.diff(values))
     step = float(moves[moves > 0].min())
-    found = []
-    for start, stop in at_end:
-        length = stop - start
-        if length < max(REPEATS, COARSE * usual) or start < 4:
-            continue
+
+    def goes_on(start: int, stop: int) -> bool:
         before = np.arange(max(start - BEFORE, 0), start)
         line = Line.through(time[before], other[before])
         # How far the other channel comes, and by how much it comes back, as means of three readings.
         part, when = (np.convolve(x[start:stop], np.ones(3) / 3, "valid") for x in (other, time))
         top = int(np.argmax(part >= part.max() - noise / np.sqrt(3)))  # around a turn it hardly moves
         elapsed, advance = float(when[top] - time[start - 1]), float(part[top] - line.at(time[start - 1]))
-        error = noise * np.sqrt(1 / 3 + 4 / len(before))
-        turned = float(part[top] - part[-1]) > ERRORS * error
-        goes_on = advance > GOES_ON * line.slope * elapsed
+        error = ERRORS * noise * np.sqrt(1 / 3 + 4 / len(before))
         # A coarse read-out rests at its last step while the true value stays below the next one.
         if Line.through(time[before], values[before]).slope * elapsed < STEPS * step:
-            continue
-        if line.slope > 0 and elapsed > 0 and advance > ERRORS * error and (goes_on or turned):
-            found.append((start, stop))
-    if not found:
-        return []
+            return False
+        keeps_pace, turned = advance > GOES_ON * line.slope * elapsed, part[top] - part[-1] > error
+        return bool(line.slope > 0 and elapsed > 0 and advance > error and (keeps_pace or turned))
+
+    found = [one for one in at_end if one[1] - one[0] >= least and one[0] >= 4 and goes_on(*one)]
     # Other stretches at the same end of the range are at it, too, however short.
-    return [one for one in at_end if one[1] - one[0] >= 2 or one in found]
+    return [one for one in at_end if one[1] - one[0] >= 2] if found else []
 
 
 def censor_force(curve: Curve) -> CensoredForce | None:
     """The test, its zero of force taken off, with the turning points that its force channel did not see; None if there
-    are none.
-    """
+    are none."""
     force, path = curve.force_mN, curve.displacement_um
     noise = point_noise(path)
     found = plateaus(force, path, curve.time_s, noise)
@@ -136,7 +123,11 @@ def censor_force(curve: Curve) -> CensoredForce | None:
     for start, stop in found:
         reached = max(reached, float(np.max(path[:start])))
         row = start + int(np.argmax(path[start:stop]))
-        top = _turning(path[start:stop], row - start, noise)
+        top = float(path[row])
+        if noise > 0:
+            # The largest of noisy readings lies too high; the mean of those near it only by what the turn leaves.
+            near = path[max(row - 2, start) : min(row + 3, stop)]
+            top = float(np.mean(near[near > top - 2.5 * noise]))
         if top <= reached:
             continue  # reloading that stays below what was reached before: elastic, the history does not change
         value, error = (np.nan, np.nan) if fitted is None else fitted(top)
@@ -144,7 +135,11 @@ def censor_force(curve: Curve) -> CensoredForce | None:
             value, error = end, noise * pace
         new_force[row], new_path[row], sd[row], turning[row] = value, top, error, True
         reached = top
-    finding = _finding(end, int(hidden.sum()), new_force[turning], sd[turning])
+    finding = FORCE_RANGE.of(end, int(hidden.sum()))
+    if turning.any():
+        largest, error = float(new_force[turning].max()), float(sd.max())
+        far = largest > (1 + TRUSTED) * end or not error < 0.5 * TRUSTED * end
+        finding = (FAR_BEYOND if far else TURNING_POINT).of(*finding.numbers, largest, error)
     keep = ~hidden | turning
     checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
     return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], finding)
@@ -152,10 +147,10 @@ def censor_force(curve: Curve) -> CensoredForce | None:
 
 def censor_displacement(curve: Curve) -> tuple[np.ndarray, Finding] | None:
     """Which readings of displacement are at the end of its range, and that in words; None if there are none."""
-    found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
+    path = curve.displacement_um
+    found = plateaus(path, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
     if not found:
         return None
-    path = curve.displacement_um
     # Of the readings within the noise of the end only those that the noise brought below it are left: they lie too low.
     rows = _inside(found, len(curve))
     rows |= path >= float(path.max()) - NEAR_END * point_noise(path[~rows])
@@ -166,25 +161,6 @@ def _inside(stretches: list[tuple[int, int]], count: int) -> np.ndarray:
     """Which of so many readings lie in stretches [start, stop)."""
     rows = np.arange(count)
     return np.any([(start <= rows) & (rows < stop) for start, stop in stretches], axis=0)
-
-
-def _finding(end: float, count: int, largest: np.ndarray, sds: np.ndarray) -> Finding:
-    if not len(largest):
-        return FORCE_RANGE.of(end, count)
-    top, sd = float(largest.max()), float(sds.max())
-    far = top > (1 + TRUSTED) * end or not sd < 0.5 * TRUSTED * end
-    return (FAR_BEYOND if far else TURNING_POINT).of(end, count, top, sd)
-
-
-def _turning(part: np.ndarray, top: int, noise: float) -> float:
-    """The largest displacement of a stretch: of the readings within the noise of the largest, their mean.
-
-    The largest of several noisy readings lies too high; the mean of those near it does not by more than the noise's
-    share that the turn itself leaves.
-    """
-    near = np.abs(np.arange(len(part)) - top) <= 2
-    close = part[near & (part > part[top] - 2.5 * noise)]
-    return float(np.mean(close)) if noise > 0 else float(part[top])
 
 
 _POWERS, _SIGNS = np.array([1, 3, 5]), np.array([1, -1, 1])

@@ -1,10 +1,10 @@
 """Cutting a test into approach, load, hold, unload and reload.
 
 The signal that the test machine controls (force or displacement) is cut at its turning points, found by hysteresis: a
-turn counts once the signal has gone back by more than the noise and more than a small share of its range. Around
-and between turning points, a hold is where the signal dwells: it stays within a narrow band for several times
-longer than the neighbouring ramps need to cross that band. What comes before the force begins to rise is the
-approach. All thresholds are shares of the curve's own range, or multiples of its own noise.
+turn counts once the signal has gone back by more than the noise and more than a small share of its range. A hold is
+where the signal stays within a narrow band for several times longer than the neighbouring ramps need to cross it. What
+comes before the force begins to rise is the approach. All thresholds are shares of the curve's own range, or multiples
+of its own noise.
 """
 
 from __future__ import annotations
@@ -12,16 +12,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from .excursions import Drive, Hold
 from .schema import Control, Curve, remembered
-from .signal import branch_envelope, median, steady_clock, two_lines
+from .signal import branch_envelope, median, noise_level, steady_clock, stretches, turning_points, two_lines
 from .validate import check_finite
+
+CONTACT = 0.01  # share of the range of force up to which the beginning may count as approach
+BEGINS_LOADED = 0.05
+"""Share of the range of force from which on a record that begins by unloading begins under load: less is the dip by
+which adhesion pulls the platens together."""
+SMALLEST_TURN = 0.005  # least depth of a turn, as a share of the signal's range
+TURN_NOISE = 8.0  # the same in standard deviations of the noise
+BAND = 0.0025  # height that a ramp must pass to be none of a hold, as a share of the range; or four deviations
+SLOWNESS = 6.0  # times longer than the ramps next to it that a hold takes for the width of the band
+HOLD_SAMPLES = 4  # of a hold, at least
 
 SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
 
@@ -52,20 +61,13 @@ class Segment:
         return self.stop - self.start
 
 
-CONTACT = 0.01  # share of the range of force up to which the beginning may count as approach
-BEGINS_LOADED = 0.05
-"""Share of the range of force from which on a record that begins by unloading begins under load: less is the dip by
-which adhesion pulls the platens together."""
-
-
 def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segment, ...]:
     """Cut a test into segments that follow each other without gap or overlap.
 
-    A reload that goes beyond the greatest force reached before is cut there: what follows is virgin "load". A pause
-    that left no samples (a gap in time) is no segment of its own. Where the force stays at its lowest level while
-    the platen moves away, that is still "unload". Small cycles that drown in noise are not found: a turn must be
-    deeper than eight times the noise's standard deviation, which is estimated from the curve. A turning point belongs
-    to the segment that starts there.
+    A reload that goes beyond the greatest force reached before is cut there: what follows is virgin "load". Where the
+    force stays at its lowest level while the platen moves away, that is still "unload". A turn must be deeper than
+    eight times the noise's standard deviation, which is estimated from the curve. A turning point belongs to the
+    segment that starts there.
 
     Args:
         curve: the test, raw.
@@ -73,40 +75,14 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
             while the force relaxes, else force.
 
     Returns:
-        The segments in order, from 0 to the number of samples. A curve without a point or with one that is not finite,
-        and a control that does not exist, raise `InputError`.
+        The segments in order, from 0 to the number of samples.
+
+    Raises:
+        InputError: for a curve without a point or with one that is not finite.
     """
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
     return remembered(curve, ("segments", control), lambda: _found(curve, control))
-
-
-def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
-    """The segments of a curve, see `find_segments`."""
-    if not len(curve):
-        raise InputError("the curve has no point", remedy="Give a test with two points or more.")
-    for name in ("time_s", "force_mN", "displacement_um"):
-        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
-    force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
-    clock = steady_clock(np.asarray(curve.time_s, float))
-    drive = Drive(force, clock)
-    if not drive.span > 0:
-        return (Segment("hold", 0, len(force)),)
-    chosen, holds = drive, drive.holds()
-    if control is None:
-        holds = [hold for hold in holds if not _moves_away(hold, drive, displacement, clock)]
-    if control != "load":
-        other = Drive(displacement, clock)
-        # Stiff unloading may drown in the displacement's noise; then only the force knows of it.
-        if len(other.turns) >= len(drive.turns):
-            other_holds = other.holds()
-            relaxing = [hold for hold in other_holds if _relaxes(hold, drive)]
-            if control == "displacement" or (
-                2 * len(relaxing) > len(other_holds) and (not _covered(relaxing, holds) or _sags(holds, drive))
-            ):
-                chosen, holds = other, other_holds
-    onset = 0 if _begins_loaded(drive) else _contact_onset(drive, displacement, clock)
-    return _assemble(chosen, holds, drive, onset)
 
 
 def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict[str, Any]]:
@@ -130,16 +106,156 @@ def contact_index(segments: Sequence[Segment]) -> int:
     return segments[0].stop if segments[0].kind == "approach" and len(segments) > 1 else 0
 
 
+class Hold(NamedTuple):
+    """Samples `start` to `stop - 1`, where the signal stands at `level`."""
+
+    start: int
+    stop: int
+    level: float
+
+
+class Drive:
+    """A signal from 0 to 1, so that nothing depends on units, with its noise, turning points and, per branch between
+    them, its direction and its monotone envelope, made rising."""
+
+    def __init__(self, values: np.ndarray, clock: np.ndarray) -> None:
+        values = np.asarray(values, float)
+        span = float(np.ptp(values))
+        self.moves = span > 0
+        self.values = values = (values - values.min()) / span if self.moves else np.zeros(len(values))
+        self.clock = clock
+        self.noise = noise_level(values, 1.0)
+        self.band = max(BAND, 4 * self.noise)
+        self.turns = turning_points(values, max(SMALLEST_TURN, TURN_NOISE * self.noise))
+        self.branches = list(pairwise(self.turns))
+        self.signs = [1 if values[b] >= values[a] else -1 for a, b in self.branches]
+        self.envelopes = [
+            branch_envelope(sign * values[a : b + 1]) for (a, b), sign in zip(self.branches, self.signs, strict=True)
+        ]
+
+    def holds(self) -> list[Hold]:
+        """All stretches where the signal stands still, in order, not overlapping."""
+        if not self.moves:
+            return []
+        found = [hold for turn in range(len(self.turns)) if (hold := self._hold_at_turn(turn)) is not None]
+        for branch in range(len(self.branches)):
+            found += self._holds_within(branch)
+        kept: list[Hold] = []
+        for hold in sorted(found, key=lambda hold: hold.start):
+            start = max(hold.start, kept[-1].stop) if kept else hold.start
+            if hold.stop - start >= HOLD_SAMPLES:
+                kept.append(hold._replace(start=start))
+        return kept
+
+    def _crossing(self, branch: int, level: float) -> float:
+        """The index (fractional) at which a branch, counted in its own direction, passes a level."""
+        envelope = self.envelopes[branch]
+        k = int(np.searchsorted(envelope, level))
+        if k <= 0 or k >= len(envelope):
+            return float(self.turns[branch] + min(max(k, 0), len(envelope) - 1))
+        low, high = envelope[k - 1], envelope[k]
+        return float(self.turns[branch] + k - 1 + (level - low) / (high - low))
+
+    def _time(self, index: float) -> float:
+        """The clock at a fractional index."""
+        k = min(int(index), len(self.clock) - 2)
+        return float(self.clock[k] + (index - k) * (self.clock[k + 1] - self.clock[k]))
+
+    def _index(self, time: float) -> int:
+        """The sample nearest to a time on the clock."""
+        k = min(max(int(np.searchsorted(self.clock, time)), 1), len(self.clock) - 1)
+        return k if self.clock[k] - time <= time - self.clock[k - 1] else k - 1
+
+    def _edge(self, branch: int, level: float, at: int, *, rising: bool) -> tuple[float, float]:
+        """The time at which a branch's ramp, drawn on straight, meets a level, and the time it takes for one band."""
+        envelope = self.envelopes[branch]
+        if rising:
+            near_level, far_level = level - self.band, max(level - 3 * self.band, envelope[0])
+        else:
+            near_level, far_level = level + self.band, min(level + 3 * self.band, envelope[-1])
+        near, far = self._time(self._crossing(branch, near_level)), self._time(self._crossing(branch, far_level))
+        # One band's crossing is blurred by noise; two are taken where the branch is deep enough.
+        pace = abs(near - far) * self.band / max(abs(near_level - far_level), 0.5 * self.band)
+        turn = float(self.clock[at])
+        return (min(near + pace, turn) if rising else max(near - pace, turn)), pace
+
+    def _hold_at_turn(self, turn: int) -> Hold | None:
+        at, left, right = self.turns[turn], turn - 1, turn
+        has_left, has_right = turn > 0, turn < len(self.turns) - 1
+        # Towards the turn the signal rises on the left branch and, seen backwards in time, on the right one.
+        sign = self.signs[left] if has_left else -self.signs[right]
+        top = sign * self.values[at]
+        near_start = self._crossing(left, top - self.band) if has_left else float(at)
+        near_stop = self._crossing(right, -(top - self.band)) if has_right else float(at)
+        inside = sign * self.values[int(np.ceil(near_start)) : int(near_stop) + 1]
+        level = median(inside) if len(inside) else top
+        start, before = self._edge(left, level, at, rising=True) if has_left else (float(self.clock[at]), 0.0)
+        stop, after = self._edge(right, -level, at, rising=False) if has_right else (float(self.clock[at]), 0.0)
+        if stop - start <= SLOWNESS * max(before, after):
+            return None
+        return Hold(self._index(start), self._index(stop) + (0 if has_right else 1), sign * level)
+
+    def _holds_within(self, branch: int) -> list[Hold]:
+        """Stretches inside a branch that take much longer for one band than the bands before and behind."""
+        envelope = self.envelopes[branch]
+        offset, count = self.turns[branch], len(envelope)
+        clock = self.clock[offset : offset + count]
+        ahead = np.searchsorted(envelope, envelope + self.band, side="right")
+        further = np.searchsorted(envelope, envelope + 3 * self.band, side="right")
+        behind = np.searchsorted(envelope, envelope - 2 * self.band, side="left") - 1
+        there = clock[np.minimum(ahead, count - 1)]
+        after = (clock[np.minimum(further, count - 1)] - there) / 2
+        before = (clock - clock[np.maximum(behind, 0)]) / 2
+        stay = there - clock
+        slow = (behind >= 0) & (further < count) & (stay > (SLOWNESS + 1) * np.maximum(before, after))
+        found = []
+        for first, last in stretches(slow):
+            # The longest stay of the run begins at the hold itself, or less than one band before.
+            best = first + int(np.argmax(stay[first:last]))
+            level = median(envelope[best : ahead[best]])
+            entry, _ = self._edge(branch, level, offset + int(ahead[best]) - 1, rising=True)
+            leave, _ = self._edge(branch, level, offset + best, rising=False)
+            found.append(Hold(self._index(entry), self._index(leave), self.signs[branch] * level))
+        return [hold for hold in found if hold.stop - hold.start >= HOLD_SAMPLES]
+
+
+def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
+    """The segments of a curve, see `find_segments`."""
+    if not len(curve):
+        raise InputError("the curve has no point", remedy="Give a test with two points or more.")
+    for name in ("time_s", "force_mN", "displacement_um"):
+        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
+    clock = steady_clock(np.asarray(curve.time_s, float))
+    drive = Drive(curve.force_mN, clock)
+    if not drive.moves:
+        return (Segment("hold", 0, len(curve)),)
+    chosen, holds = drive, drive.holds()
+    if control is None:
+        holds = [hold for hold in holds if not _moves_away(hold, drive, curve.displacement_um)]
+    if control != "load":
+        other = Drive(curve.displacement_um, clock)
+        # Stiff unloading may drown in the displacement's noise; then only the force knows of it.
+        if len(other.turns) >= len(drive.turns):
+            other_holds = other.holds()
+            relaxing = [hold for hold in other_holds if _relaxes(hold, drive)]
+            if control == "displacement" or (
+                2 * len(relaxing) > len(other_holds) and (not _covered(relaxing, holds) or _sags(holds, drive))
+            ):
+                chosen, holds = other, other_holds
+    onset = 0 if _begins_loaded(drive) else _contact_onset(drive, curve.displacement_um)
+    return _assemble(chosen, holds, drive, onset)
+
+
 def _begins_loaded(force: Drive) -> bool:
     """Whether the record begins under load and unloads first."""
-    return bool(force.signs and force.signs[0] < 0 and force.values[0] > BEGINS_LOADED * force.span)
+    return bool(force.signs and force.signs[0] < 0 and force.values[0] > BEGINS_LOADED)
 
 
-def _moves_away(hold: Hold, force: Drive, displacement: np.ndarray, clock: np.ndarray) -> bool:
+def _moves_away(hold: Hold, force: Drive, displacement: np.ndarray) -> bool:
     """Whether a stretch of constant force is just the platen moving out of (or without) contact."""
-    if hold.level > force.values.min() + max(0.05 * force.span, force.band):
+    if hold.level > max(0.05, force.band):
         return False
-    stop = min(hold.stop, len(clock)) - 1
+    clock, stop = force.clock, hold.stop - 1
     rate = abs(displacement[stop] - displacement[hold.start]) / max(clock[stop] - clock[hold.start], 1e-300)
     typical = np.ptp(displacement) / max(clock[-1] - clock[0], 1e-300)
     return bool(rate > 0.5 * typical)
@@ -148,15 +264,13 @@ def _moves_away(hold: Hold, force: Drive, displacement: np.ndarray, clock: np.nd
 def _relaxes(hold: Hold, force: Drive) -> bool:
     """Whether the force decays towards rest in a stretch of constant displacement."""
     part = force.values[hold.start : hold.stop]
-    third = max(len(part) // 3, 1)
-    begin = median(part[: max(third // 3, 1)])
-    middle, end = (median(some) if len(some) else np.nan for some in (part[third : 2 * third], part[-third:]))
-    if begin - end < max(0.01 * force.span, 3 * force.noise) or begin - end > 0.6 * (begin - force.values.min()):
+    third = len(part) // 3
+    begin, middle, end = (median(some) for some in (part[: max(third // 3, 1)], part[third : 2 * third], part[-third:]))
+    if begin - end < max(0.01, 3 * force.noise) or begin - end > 0.6 * begin:
         return False
     # Stiff unloading also leaves the displacement as it was, but it goes on at the pace of a ramp.
-    turns = force.values[np.array(force.turns)]
-    pace = float(np.abs(np.diff(turns)).sum() / force.clock[-1])
-    span = float(force.clock[min(hold.stop, len(force.clock)) - 1] - force.clock[hold.start]) / 2
+    pace = float(np.abs(np.diff(force.values[force.turns])).sum() / force.clock[-1])
+    span = float(force.clock[hold.stop - 1] - force.clock[hold.start]) / 2
     slows = middle - end < 0.45 * (begin - middle) and middle - end < 0.25 * pace * span
     return slows and end < middle + max(0.25 * (begin - middle), force.noise)
 
@@ -170,29 +284,23 @@ def _covered(holds: list[Hold], by: list[Hold]) -> bool:
 
 def _sags(holds: list[Hold], force: Drive) -> bool:
     """Whether the force falls, beyond doubt, within most of the stretches that seem constant."""
-    count = 0
-    for hold in holds:
-        third = max((hold.stop - hold.start) // 3, 1)
-        part = force.values[hold.start : hold.stop]
-        fall = median(part[:third]) - median(part[-third:])
-        count += fall > max(6 * force.noise / np.sqrt(third), 0.2 * force.band)
-    return bool(2 * count > len(holds))
+    parts = [(force.values[hold.start : hold.stop], (hold.stop - hold.start) // 3) for hold in holds]
+    falls = [
+        median(part[:third]) - median(part[-third:]) > max(6 * force.noise / np.sqrt(third), 0.2 * force.band)
+        for part, third in parts
+    ]
+    return 2 * sum(falls) > len(holds)
 
 
-def _contact_onset(force: Drive, displacement: np.ndarray, clock: np.ndarray) -> int:
+def _contact_onset(force: Drive, displacement: np.ndarray) -> int:
     """The index at which the force begins to rise; 0 if the curve begins in contact.
 
-    Up to a small force, a flat stretch followed by a rise lies far below the straight line from its first to its
-    last point; a smooth rise from the first sample on does not.
+    Up to a small force, a flat stretch and a rise lie far below the line from first to last point; a smooth rise does
+    not.
     """
     values, least = force.values, 10 * force.noise
-    rise = max(CONTACT * force.span, least)
-    peaks = (
-        b
-        for a, b, sign in zip(force.turns, force.turns[1:], force.signs, strict=False)
-        if sign > 0 and values[b] - values[a] > 1.5 * rise
-    )
-    peak = next(peaks, None)
+    rise = max(CONTACT, least)
+    peak = next((b for a, b in force.branches if values[b] - values[a] > 1.5 * rise), None)
     if peak is None:
         return 0
     before = values[: peak + 1]
@@ -200,7 +308,7 @@ def _contact_onset(force: Drive, displacement: np.ndarray, clock: np.ndarray) ->
     onset = 0
     while True:
         stop = int(np.flatnonzero(before <= base + rise)[-1]) + 1
-        along = _bend(values[:stop], rise, (clock, displacement))
+        along = _bend(values[:stop], rise, (force.clock, displacement))
         # Some samples of the rise must be seen to distinguish it from what precedes it, also where it is steep.
         stop = min(stop + 8, peak + 1)
         if along is None or stop < 8:
@@ -239,7 +347,7 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
         reached = virgin = float(force.values[0]) - 2 * force.noise
         unloaded = True
     crossed = -1
-    for a, b, sign in zip(drive.turns, drive.turns[1:], drive.signs, strict=False):
+    for (a, b), sign in zip(drive.branches, drive.signs, strict=True):
         if sign < 0:
             # The turning point belongs to what starts there, unless it is all that went beyond the peaks before.
             kinds[a + (crossed == a and unloaded) : b + 1] = "unload"

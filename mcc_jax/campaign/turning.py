@@ -1,8 +1,7 @@
 """The force at which each branch of a test begins, estimated from the ramp or the hold around it, with its error.
 
-The largest of many noisy readings lies above the force that was reached, and a hold offers hundreds of them. The law
-unloads from the force that was reached, so a turning point is where the ramps before and behind it meet, or the mean of
-the hold between them.
+The largest of many noisy readings lies above the force that was reached, from which the law unloads: a turning point is
+where the ramps before and behind it meet, or the mean of the hold between them.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from .._format import described
 from .schema import Curve
@@ -75,7 +75,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...]) -> TurningForces
             continue
         if level is None:  # the record begins behind its peak
             level, level_error = float(raw[part.start]), 1.0
-            if len(raw[rows]) >= LEAST:
+            if len(part) >= LEAST:
                 level = max(float(Line.through(time[rows][:MOST], raw[rows][:MOST]).at(time[part.start])), level)
         peak[rows], error[rows] = level, level_error
         force[rows] = np.minimum(raw[rows], level)
@@ -99,40 +99,39 @@ def _level(
     time: np.ndarray, raw: np.ndarray, up: Segment, after: Segment, noise: float, share: float
 ) -> tuple[float, float]:
     """The force at which loading ends, and its standard error in those of a reading."""
-    held = _held(time, raw, after, noise) if after.kind == "hold" and share else None
+    hold = after.kind == "hold"
+    held = _held(time, raw, after, noise) if hold and share else None
     if held is not None:
         return float(np.mean(raw[held])), 1 / np.sqrt(len(held))
     largest = float(raw[up.start : min(after.start + 1, after.stop)].max())
     if noise <= RESOLVED * abs(largest):
         return largest, 1.0
-    near = raw > (1 - share) * largest
     turn = float(time[after.start])
-    before = _run(near, up.start, up.stop, -1)
-    behind = _run(near, after.start, after.stop, 1)
-    held = after.kind == "hold"  # a relaxing force: only the ramp shows where it began
-    # The readings next to the turn may be on either side of it: first without them, then each where it belongs.
-    next_to = 0 if held else 1
-    rising = _Curve.through(time, raw, before[: len(before) - next_to], turn, noise)
-    falling = _Curve.through(time, raw, behind[next_to:], turn, noise)
-    if rising is None or falling is None:
-        return largest, 1.0
-    if held:
+    near = raw > (1 - share) * largest
+    before, behind = _run(near, up.start, up.stop, -1), _run(near, after.start, after.stop, 1)
+    if hold:  # a relaxing force: only the ramp shows where it began
+        rising = _fitted(time, raw, before, turn, noise)
+        if rising is None or _fitted(time, raw, behind, turn, noise) is None:
+            return largest, 1.0
         level, variance = rising.at(0.0)
         return (largest, 1.0) if abs(level - largest) > APART * noise else (level, min(variance**0.5, 1.0))
-    step = max(
-        turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn
-    )
+    # The readings next to the turn may be on either side of it: first without them, then each where it belongs.
+    rising, falling = _fitted(time, raw, before[:-1], turn, noise), _fitted(time, raw, behind[1:], turn, noise)
+    if rising is None or falling is None:
+        return largest, 1.0
+    ahead, following = time[max(after.start - 1, up.start)], time[min(after.start + 1, len(time) - 1)]
+    step = max(turn - float(ahead), float(following) - turn)
     both = np.concatenate([before, behind])
     early = time[both] < turn + _meeting(rising, falling, step)
-    parts = [_Curve.through(time, raw, both[side], turn, noise) for side in (early, ~early)]
+    parts = [_fitted(time, raw, both[side], turn, noise) for side in (early, ~early)]
     if parts[0] is not None and parts[1] is not None:
-        rising, falling = parts[0], parts[1]
+        rising, falling = parts
     meet = _meeting(rising, falling, step)
     (one, first), (other, second) = rising.at(meet), falling.at(meet)
-    steep, down = rising.slope(meet), falling.slope(meet)
+    steep, down = (float(ramp.course.deriv()(meet)) for ramp in (rising, falling))
     # Where two lines meet: each is weighed by the slope of the other.
-    share = down / (down - steep) if steep > 0 > down else 0.5
-    level, variance = share * one + (1 - share) * other, share**2 * first + (1 - share) ** 2 * second
+    weight = down / (down - steep) if steep > 0 > down else 0.5
+    level, variance = weight * one + (1 - weight) * other, weight**2 * first + (1 - weight) ** 2 * second
     # Between two readings the force rises further than the larger of them, but not past the readings themselves.
     if not abs(level - largest) <= APART * noise + step * max(steep, -down, 0.0):
         return largest, 1.0
@@ -144,24 +143,21 @@ def _level(
     return float(level), float(min(np.sqrt(variance), 1.0))
 
 
-def _meeting(rising: _Curve, falling: _Curve, step: float) -> float:
+def _meeting(rising: _Ramp, falling: _Ramp, step: float) -> float:
     """When the ramps before and behind a turning point come closest to each other, from the turning reading on."""
     instants = np.linspace(-step, step, 41)
-    return float(instants[int(np.argmin(np.abs(rising.along(instants) - falling.along(instants))))])
+    return float(instants[int(np.argmin(np.abs(rising.course(instants) - falling.course(instants))))])
 
 
 def _run(near: np.ndarray, start: int, stop: int, direction: int) -> np.ndarray:
     """Rows of the unbroken run of `near` at the end (-1) or the beginning (1) of a segment."""
     order = np.arange(start, stop)[::direction]
-    order = order[: int(np.argmin(near[order])) if not near[order].all() else len(order)]
-    return np.sort(order[:MOST])
+    return np.sort(order[np.logical_and.accumulate(near[order])][:MOST])
 
 
 def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.ndarray | None:
-    """Rows of a hold whose readings scatter about one force; None where the force relaxes.
-
-    A hold begins and ends with readings of the ramps next to it that come close to it: they are far from the others.
-    """
+    """Rows of a hold whose readings scatter about one force, without readings of the ramps next to it; None where the
+    force relaxes."""
     force = raw[part.start : part.stop]
     away = np.abs(force - median(force))
     sd = 1.4826 * median(away)
@@ -172,36 +168,28 @@ def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.
     return rows if line.spread == 0 or sd == 0 or abs(line.slope) <= TREND * line.slope_sd else None
 
 
-class _Curve(NamedTuple):
-    """A line or parabola through readings near a turning point, and its covariance for readings of variance 1."""
+class _Ramp(NamedTuple):
+    """A line or parabola of force over the time from a turning point, and its covariance for readings of variance 1."""
 
-    values: np.ndarray
+    course: Polynomial
     covariance: np.ndarray
-    unit: float
-
-    @classmethod
-    def through(cls, time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, noise: float) -> _Curve | None:
-        """The one through as many of the rows nearest the turning point as it follows to within the noise."""
-        while len(rows) >= LEAST and np.ptp(time[rows]) > 0:
-            x, force = time[rows] - turn, raw[rows]
-            unit = float(np.abs(x).max())
-            design = np.vander(x / unit, 3 if len(rows) >= CURVED else 2, increasing=True)
-            values, _, rank, _ = np.linalg.lstsq(design, force, rcond=None)
-            left = force - design @ values
-            if rank == design.shape[1] and left @ left <= (FITS * noise) ** 2 * len(rows):
-                return cls(values, np.linalg.inv(design.T @ design), unit)
-            nearest = np.argsort(np.abs(x), kind="stable")[: len(rows) // 2]
-            rows = np.sort(rows[nearest])
-        return None
 
     def at(self, time: float) -> tuple[float, float]:
-        x = (time / self.unit) ** np.arange(len(self.values))
-        return float(x @ self.values), float(x @ self.covariance @ x)
+        """Force and variance."""
+        x = self.course.mapparms()[1] * time
+        powers = x ** np.arange(len(self.covariance))
+        return float(self.course(time)), float(powers @ self.covariance @ powers)
 
-    def along(self, time: np.ndarray) -> np.ndarray:
-        """Its values at several times."""
-        return np.asarray((time[:, None] / self.unit) ** np.arange(len(self.values)) @ self.values)
 
-    def slope(self, time: float) -> float:
-        k = np.arange(1, len(self.values))
-        return float((k * (time / self.unit) ** (k - 1)) @ self.values[1:] / self.unit)
+def _fitted(time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, noise: float) -> _Ramp | None:
+    """The course through as many of the rows nearest the turning point as it follows to within the noise."""
+    while len(rows) >= LEAST and np.ptp(time[rows]) > 0:
+        x, force = time[rows] - turn, raw[rows]
+        unit = float(np.abs(x).max())
+        design = np.vander(x / unit, 3 if len(rows) >= CURVED else 2, increasing=True)
+        values, _, rank, _ = np.linalg.lstsq(design, force, rcond=None)
+        left = force - design @ values
+        if rank == design.shape[1] and left @ left <= (FITS * noise) ** 2 * len(rows):
+            return _Ramp(Polynomial(values, domain=[-unit, unit]), np.linalg.inv(design.T @ design))
+        rows = np.sort(rows[np.argsort(np.abs(x), kind="stable")[: len(rows) // 2]])
+    return None

@@ -1,4 +1,4 @@
-"""Units, times and swapped columns that a file may have wrong, as hypotheses: how likely each makes its numbers.
+"""What a test shows whatever its units, and which wrong units, times or swapped columns would explain it.
 
 Forces, displacements, diameters and times enter as logarithms, in which a wrong unit is a shift, so that all hypotheses
 together cost next to nothing.
@@ -14,52 +14,163 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .curve_features import CurveFeatures
+from .signal import median, point_noise
+
+CONTACT = 0.005
+"""Share of the peak force at which contact counts as made. Low, because soft particles deform much under little force:
+cellulose takes a quarter of its displacement below 3 % of its force."""
+CONTACT_NOISE = 4.0  # the same in standard deviations of the force's noise, where that is more
+LOADED = 4.0
+"""Multiple of the force at which contact counts as made that no reading before contact reaches. Unloadings after it are
+part of the test; a first cycle below it, 2 % of the peak, is taken for part of the approach."""
+UNLOADING = (0.9, 0.5)
+"""Shares of the peak force between which unloading is taken as a line: below, the unloading of a plastic contact bends
+(Oliver and Pharr 1992); above, it still creeps."""
+LEAST_RETREAT = 0.2  # share of the displacement that must be given back for the lost work to count
+CORRELATION = 0.6
+"""Least correlation of force and displacement from contact to peak, over forces not reached before: without a particle
+it is less, in loading of any material more than 0.8."""
+MOST_SAMPLES = 4000  # longer records are thinned: enough for features of a curve's size
+
 
 Range = tuple[float, float]
 Values = np.ndarray | float
 
 
-class Solid(NamedTuple):
-    """Ranges of one class of solids, as particles between platens show them at the peak of a test.
+class CurveFeatures(NamedTuple):
+    """One test (or several, as arrays), counted positive in compression; NaN where it does not show a feature."""
 
-    Attributes:
-        modulus_MPa: elastic modulus by the slope of unloading (Oliver and Pharr 1992, with the contact radius of a
-            plastic sphere).
-        loading_modulus_MPa: modulus of the elastic sphere (Hertz) that the same force would compress as far; less than
-            the modulus where the contact yields, or where loose first contact adds to the displacement.
-        stress_MPa: force / (pi R_e^2).
-        strain: displacement / D_e.
-        pressure_MPa: mean pressure in the contact, force / (pi R_e displacement); at most the hardness.
-        weight: prior log odds of the class against those that are usually tested.
-    """
+    force_sign: Any  # -1 where the forces are negative in compression, else 1
+    displacement_sign: Any  # -1 where the displacements fall as the load rises, else 1
+    force_mN: Any  # the largest
+    displacement_um: Any  # from contact to there
+    slope_mN_per_um: Any  # at the beginning of unloading
+    fullness: Any  # area below the loading curve as a share of its box: 1 / (1 + n) for a power n of the displacement
+    loss: Any  # share of the work of loading that unloading does not give back; negative where more came back
+    loading_s: Any  # time from a tenth to nine tenths of the peak force
+    interval_s: Any  # median time between two samples
 
-    modulus_MPa: Range
-    loading_modulus_MPa: Range
-    stress_MPa: Range
-    strain: Range
-    pressure_MPa: Range
-    weight: float = 0.0
+
+def curve_features(time: np.ndarray, force: np.ndarray, displacement: np.ndarray) -> CurveFeatures | None:
+    """The features of one test [s, mN, um]; None if it shows no loading or holds values that are not finite."""
+    step = -(-len(time) // MOST_SAMPLES)
+    time, force, displacement = (np.asarray(values, float)[::step] for values in (time, force, displacement))
+    if len(time) < 2 or not all(np.isfinite(v).all() for v in (time, force, displacement)):
+        return None
+    force, displacement = _without_spikes(force), _without_spikes(displacement)
+    with np.errstate(all="ignore"):
+        low, high = float(force.min()), float(force.max())
+        if min(abs(low), abs(high)) > 0.5 * (high - low) and low * high > 0:
+            return None  # far from zero all the time: a large offset, or a preload without a test
+        force_sign = 1 if high >= -low else -1
+        rise = force_sign * force
+        peak = int(np.argmax(rise))
+        if not (np.isfinite(rise[peak]) and rise[peak] > 0):
+            return None
+        begins_at_peak = peak < 0.05 * len(rise)
+        contact, base = (0, 0.0) if begins_at_peak else _contact(rise[: peak + 1])
+        load = rise - base
+        part = slice(peak, None) if begins_at_peak else slice(contact, peak + 1)
+        together = _correlation(load[part], displacement[part])
+        if abs(together) < CORRELATION:
+            return None
+        displacement_sign = 1 if together > 0 else -1
+        depth = displacement_sign * displacement
+        height = float(load[peak])
+        way = float(abs(depth[peak]) if begins_at_peak else depth[peak] - depth[contact])
+        fullness = loading_s = loss = np.nan
+        if not begins_at_peak and way > 0:
+            rows = contact + np.flatnonzero(_virgin(load[contact : peak + 1]))
+            fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
+            first, last = (rows[np.argmax(load[rows] >= share * height)] for share in (0.1, 0.9))
+            loading_s = float(time[last] - time[first])
+            if depth[peak] - depth[peak:].min() > LEAST_RETREAT * way and fullness > 0:
+                loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
+        slope, interval_s = _unloading_slope(load[peak:], depth[peak:]), median(np.diff(time))
+        way = way if way > 0 else np.nan
+        return CurveFeatures(force_sign, displacement_sign, height, way, slope, fullness, loss, loading_s, interval_s)
+
+
+def _without_spikes(values: np.ndarray) -> np.ndarray:
+    """Running median of five, so that one wild reading is no peak."""
+    if len(values) < 9:
+        return values
+    out = values.copy()
+    out[2:-2] = np.partition(np.lib.stride_tricks.sliding_window_view(values, 5), 2, axis=1)[:, 2]
+    out[:2], out[-2:] = median(values[:5]), median(values[-5:])
+    return out
+
+
+def _contact(rise: np.ndarray) -> tuple[int, float]:
+    """The last sample before the force first rises for good, and the force there; later unloadings do not count."""
+    noise = point_noise(rise)
+    base = float(rise.min()) + 2 * noise  # the least of some hundred readings lies about two deviations below
+    level = max(CONTACT * (float(rise[-1]) - base), CONTACT_NOISE * noise)
+    first_rise = int(np.argmax(rise - base >= LOADED * level))
+    below = np.flatnonzero(rise[:first_rise] <= base + level)
+    return (int(below[-1]) if len(below) and below[-1] < len(rise) - 1 else 0), base
+
+
+def _virgin(load: np.ndarray) -> np.ndarray:
+    """Which samples have a load that was not reached before."""
+    return load >= np.maximum.accumulate(load)
+
+
+def _correlation(load: np.ndarray, depth: np.ndarray) -> float:
+    """Of the samples whose load was not reached before (or is not again, where the record only unloads)."""
+    if load[0] <= load[-1]:
+        load, depth = load[_virgin(load)], depth[_virgin(load)]
+    if not (np.ptp(load) > 0 and np.ptp(depth) > 0):
+        return 0.0
+    return float(np.corrcoef(load / np.ptp(load), depth / np.ptp(depth))[0, 1])
+
+
+def _unloading_slope(load: np.ndarray, depth: np.ndarray) -> float:
+    """Slope of the first unloading; NaN where none is seen, or the displacement goes on as the force falls."""
+    begin, end = (share * load[0] for share in UNLOADING)
+    if not (load < begin).any():
+        return np.nan
+    first = int(np.argmax(load < begin))
+    deep = np.flatnonzero(load[first:] < end)
+    last = first + int(deep[0] if len(deep) else np.argmin(load[first:]))
+    fall, back = float(load[first] - load[last]), float(depth[first] - depth[last])
+    if last - first < 3 or fall < 0.1 * load[0] or back <= 3 * point_noise(depth):
+        return np.nan
+    return fall / back
+
+
+class Properties(NamedTuple):
+    """What the peak of a test shows of its material, as values (decades) or as ranges of one class of solids."""
+
+    modulus_MPa: Any  # by the slope of unloading (Oliver and Pharr 1992, with the contact radius of a plastic sphere)
+    loading_modulus_MPa: Any
+    """Of the elastic sphere (Hertz) that the same force would compress as far; less than the modulus where the contact
+    yields, or where loose first contact adds to the displacement."""
+    stress_MPa: Any  # force / (pi R_e^2)
+    strain: Any  # displacement / D_e
+    pressure_MPa: Any  # mean in the contact, force / (pi R_e displacement); at most the hardness
 
 
 SOLIDS = (
     # Soft. Below 0.2 MPa only surface irregularities deform (Bommireddy et al. 2018, section 3), so no test ends there.
     # Polymers yield at strains of 1 to 5 % (Ashby), and a test that shows plasticity goes beyond 3 %.
-    Solid((50.0, 6e4), (5.0, 3e4), (0.2, 2e3), (0.03, 1.2), (0.3, 2e3)),
+    Properties((50.0, 6e4), (5.0, 3e4), (0.2, 2e3), (0.03, 1.2), (0.3, 2e3)),
     # Ceramic. Pressures begin at the hardness of lead, 30 MPa, here and below. Measured pebbles of lithium ceramics
     # have loading moduli of 0.8 to 180 GPa, strains of 0.7 to 17 % and pressures of 0.2 to 3.2 GPa.
-    Solid((5e3, 9e5), (8e2, 9e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 4e4)),
-    # Ductile metal, with moduli to that of molybdenum (330 GPa). Metals between platens are rarer than the cellulose
-    # and the ceramics for which law and test machines are made, one in eight by assumption.
-    Solid((5e3, 3.5e5), (3e2, 3.5e5), (0.02, 3e3), (3e-4, 0.9), (30.0, 4e3), -2.0),
+    Properties((5e3, 9e5), (8e2, 9e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 4e4)),
+    # Ductile metal, with moduli to that of molybdenum (330 GPa).
+    Properties((5e3, 3.5e5), (3e2, 3.5e5), (0.02, 3e3), (3e-4, 0.9), (30.0, 4e3)),
     # Hard metal, to hardened steel and cemented carbides. It breaks: a yield strength above 1.3 GPa leaves less than
     # 10 % of elongation (Ashby, strength against ductility).
-    Solid((5e3, 7e5), (3e2, 7e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 2e4), -2.0),
+    Properties((5e3, 7e5), (3e2, 7e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 2e4)),
 )
+WEIGHTS = (0.0, 0.0, -2.0, -2.0)
+"""Prior log odds of these classes. Metals between platens are rarer than the cellulose and the ceramics for which law
+and test machines are made, one in eight by assumption."""
 DIAMETER_UM = (3.0, 2e4)  # what test machines for single particles take between their platens
 FORCE_MN = (1e-3, 1e8)  # peaks, from a nanoindenter's least to a universal test machine's largest (100 kN)
 DISPLACEMENT_UM = (0.01, 1e4)  # at the peak; below 10 nm nobody resolves a curve
@@ -80,17 +191,11 @@ MORE = -2.0  # added for each further column
 
 
 class UnitError(NamedTuple):
-    """One way in which numbers may be wrong.
+    """One way in which numbers may be wrong."""
 
-    Attributes:
-        decades: what undoing it adds to the logarithms of force, displacement, D1, D2, D3 and time.
-        prior: its log odds.
-        swapped: whether force and displacement are exchanged.
-    """
-
-    decades: tuple[float, ...]
-    prior: float = UNIT_ERROR
-    swapped: bool = False
+    decades: tuple[float, ...]  # what undoing it adds to the logarithms of force, displacement, D1, D2, D3 and time
+    prior: float = UNIT_ERROR  # its log odds
+    swapped: bool = False  # whether force and displacement are exchanged
 
 
 AS_GIVEN = UnitError((0.0,) * 6, 0.0)
@@ -116,19 +221,15 @@ def hypotheses() -> list[UnitError]:
     return [*found, UnitError((0.0, 0.0, double, double, double, 0.0)), UnitError(AS_GIVEN.decades, swapped=True)]
 
 
-def log_numbers(features: Sequence[CurveFeatures | None], diameters_um: np.ndarray) -> np.ndarray:
-    """Decades of force, displacement, D1, D2, D3 and slope, then fullness and loss, shape (N, 8)."""
-    names = ("force_mN", "displacement_um", "slope_mN_per_um", "fullness", "loss")
-    rows = [[np.nan if one is None else getattr(one, name) for name in names] for one in features]
-    force, displacement, slope, fullness, loss = np.array(rows, float).T
-    return np.column_stack([*np.log10([force, displacement, *diameters_um.T, slope]), fullness, loss])
+def log_numbers(it: CurveFeatures, diameters_um: np.ndarray) -> np.ndarray:
+    """Decades of force, displacement, D1, D2, D3 and slope, then fullness and loss, of N tests, shape (N, 8)."""
+    decades = np.log10([it.force_mN, it.displacement_um, *diameters_um.T, it.slope_mN_per_um])
+    return np.column_stack([*decades, it.fullness, it.loss])
 
 
 def undo(numbers: np.ndarray, swapped: np.ndarray, errors: Sequence[UnitError]) -> np.ndarray:
-    """The numbers of N tests with each of H unit errors undone, shape (N, H, 8).
-
-    `numbers` are as `log_numbers` gives them, shape (N, 8), `swapped` the same with force and displacement exchanged.
-    """
+    """The numbers of N tests, and the same with force and displacement exchanged, shape (N, 8), with each of H unit
+    errors undone, shape (N, H, 8)."""
     out = np.stack([swapped if one.swapped else numbers for one in errors], axis=1)
     shifts = np.array([one.decades for one in errors])
     out[..., :5] += shifts[:, :5]
@@ -136,53 +237,45 @@ def undo(numbers: np.ndarray, swapped: np.ndarray, errors: Sequence[UnitError]) 
     return out
 
 
-class Apparent(NamedTuple):
-    """Decades of what a test shows of its material; arrays of one shape."""
-
-    modulus: np.ndarray
-    loading_modulus: np.ndarray
-    stress: np.ndarray
-    strain: np.ndarray
-    pressure: np.ndarray
-    closure: np.ndarray
-
-
-def apparent(numbers: np.ndarray) -> Apparent:
-    """From numbers as `log_numbers` gives them, shape (..., 8)."""
-    force, way, d1, d2, d3, slope = (numbers[..., i] for i in range(6))
+def apparent(numbers: np.ndarray) -> Properties:
+    """What numbers as `log_numbers` gives them, shape (..., 8), show of the material, in decades."""
+    force, way, d1, d2, d3, slope = np.moveaxis(numbers, -1, 0)[:6]
     diameter = d1 + d2 - d3
     radius = diameter - np.log10(2)
     # 1 mN / um^2 = 1000 MPa.
-    return Apparent(
+    return Properties(
         # Two contacts of radius a in series: S = E a, and a^2 = R gamma under full plasticity.
-        modulus=np.asarray(slope + 3 - 0.5 * (radius + way)),
+        modulus_MPa=slope + 3 - 0.5 * (radius + way),
         # Hertz, half the displacement at each platen: F = 4/3 E sqrt(R) (gamma / 2)^1.5.
-        loading_modulus=np.asarray(force + 3 + np.log10(0.75) - 0.5 * radius - 1.5 * (way - np.log10(2))),
-        stress=np.asarray(force + 3 - np.log10(np.pi) - 2 * radius),
-        strain=np.asarray(way - diameter),
-        pressure=np.asarray(force + 3 - np.log10(np.pi) - radius - way),
-        closure=np.asarray(way - d3),
+        loading_modulus_MPa=force + 3 + np.log10(0.75) - 0.5 * radius - 1.5 * (way - np.log10(2)),
+        stress_MPa=force + 3 - np.log10(np.pi) - 2 * radius,
+        strain=way - diameter,
+        pressure_MPa=force + 3 - np.log10(np.pi) - radius - way,
     )
 
 
-def log_density(numbers: np.ndarray) -> np.ndarray:
-    """Log density of tests under the ranges, up to a constant; -inf where nothing can be said.
+def closure(numbers: np.ndarray) -> np.ndarray:
+    """Displacement over D3, in decades."""
+    return numbers[..., 1] - numbers[..., 4]
 
-    `numbers` are as `log_numbers` gives them, shape (..., 8).
-    """
-    it, diameters = apparent(numbers), numbers[..., 2:5]
+
+def log_density(numbers: np.ndarray) -> np.ndarray:
+    """Log density under the ranges, up to a constant, of numbers as `log_numbers` gives them, shape (..., 8); -inf
+    where nothing can be said."""
 
     def far(value: Values, within: Range) -> Values:
         low, high = np.log10(within)
         middle = (value - (low + high) / 2) / ((high - low) / 2)
         return beyond(value, (low, high)) + TILT * np.nan_to_num(middle) ** 2
 
+    diameters = numbers[..., 2:5]
     common = sum(far(diameters[..., i], DIAMETER_UM) for i in range(3))
     common = common + far(numbers[..., 0], FORCE_MN) + far(numbers[..., 1], DISPLACEMENT_UM)
     common = common + beyond(diameters.max(-1) - diameters.min(-1), np.log10(ELONGATION))
-    common = common + beyond(it.closure, np.log10(CLOSURE), CLOSURE_EDGE)
+    common = common + beyond(closure(numbers), np.log10(CLOSURE), CLOSURE_EDGE)
     common = common + beyond(numbers[..., 6], FULLNESS, FULLNESS_EDGE) + beyond(numbers[..., 7], LOSS, LOSS_EDGE)
-    classes = [sum(map(far, it[:5], solid[:5])) - solid.weight for solid in SOLIDS]
+    it = apparent(numbers)
+    classes = [sum(map(far, it, solid)) - weight for solid, weight in zip(SOLIDS, WEIGHTS, strict=True)]
     total = -(common + np.min(classes, axis=0))
     return np.where(np.isfinite(numbers[..., 0]) & np.isfinite(numbers[..., 2]), total, -np.inf)
 
@@ -214,25 +307,24 @@ def in_words(error: UnitError) -> tuple[str, str]:
         return said, f"if they are radii, write twice these values into {where}"
     force, way, *sizes, time = map(round, error.decades)
     which = [f"D{i}" for i, decades in enumerate(sizes, start=1) if decades]
-    size = "diameters" if len(which) == 3 else f"diameters {''.join(which)}"
-    columns = (
-        ("forces", force, _FORCES, "mN", ["force"], "curves.csv"),
-        ("displacements", way, _LENGTHS, "um", ["displacement"], "curves.csv"),
-        (size, max(sizes, key=abs), _LENGTHS, "um", which, "particles.csv"),
-        ("times", time, _TIMES, "s", ["time"], "curves.csv"),
-    )
+    diameters = "diameters" if len(which) == 3 else f"diameters {''.join(which)}"
     said, remedies = [], []
-    for what, decades, units, right, names, file in columns:
+    for what, names, decades, units, right in (
+        ("forces", ["force"], force, _FORCES, "mN"),
+        ("displacements", ["displacement"], way, _LENGTHS, "um"),
+        (diameters, which, max(sizes, key=abs), _LENGTHS, "um"),
+        ("times", ["time"], time, _TIMES, "s"),
+    ):
         if not decades:
             continue
         unit, times = units[decades], "1000 times" if abs(decades) == 3 else "a million times"
         much, other = ("large", "smaller") if decades < 0 else ("small", "larger")
         said.append(f"the {what} seem {times} too {much}, as {unit} taken for {right}")
-        name = ", ".join(f"{name}_{unit}" for name in names)
-        mapped = f'in a mapping file: unit = "{unit}"' if file == "curves.csv" else "or convert them to um"
+        columns = f"column{'s' if len(names) > 1 else ''} {', '.join(f'{name}_{unit}' for name in names)}"
+        file, mapped = "curves.csv", f'in a mapping file: unit = "{unit}"'
+        if what == diameters:
+            file, mapped = "particles.csv", "or convert them to um"
         # The numbers may have been given in any unit; what is known is the factor.
-        remedies.append(
-            f"if the {what} are in {unit}, name the column{'s' if len(names) > 1 else ''} {name} in {file}"
-            f" ({mapped}; in place of another unit, take the one {times} {other})"
-        )
+        instead = f"in place of another unit, take the one {times} {other}"
+        remedies.append(f"if the {what} are in {unit}, name the {columns} in {file} ({mapped}; {instead})")
     return " and ".join(said), "; ".join(remedies)

@@ -1,8 +1,9 @@
-"""Simulated campaigns: the law in place of the particles, everything else as in a measurement."""
+"""Simulated campaigns: the law, and effects hidden in it, in place of the particles; all else as in a measurement."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
+from .._format import number
 from .._results import RESULTS
 from .._types import ScalarLike
 from ..campaign import (
@@ -27,12 +29,119 @@ from ..campaign import (
     Metadata,
     particle_batch,
 )
-from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need
+from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, AbstractEffect, Need, Variant, find_variant
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 from .drive import refusal, simulate_batch
-from .effects import HiddenEffect, hidden_effects, humidities_of
 from .programme import Instrument, Programme
+
+_STREAM = 0x0EFF_EC75
+"""Separates the draws of effects from those of noise, coefficients and peaks."""
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """An effect for `simulate_campaign`.
+
+    Attributes:
+        variant: its formula.
+        amplitude: its strength in the variant's unit; where the variant differs at random from test to test, the
+            standard deviation. The middle of the plausible range if None.
+        nuisance: nuisance parameters by name, the same in all tests; those not given take the variant's middle value,
+            or are drawn for every test where the variant says so.
+    """
+
+    variant: Variant
+    amplitude: float | None = None
+    nuisance: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        variant = self.variant
+        physical: dict[str, float] = {1: {"least": 0.0}, -1: {"most": 0.0}, 0: {}}[variant.sign]
+        arguments.number(self.strength, f"{variant.label}: {variant.parameter}", **physical)
+        variant.check_names(self.nuisance)
+        for one in variant.nuisances:
+            bound = {"above": 0.0} if one.plausible[0] > 0 else {}
+            arguments.number(self.numbers[one.name], f"{variant.label}: {one.name}", **bound)
+
+    def __repr__(self) -> str:
+        named = ", ".join(f"{name} {number(value)}" for name, value in self.numbers.items())
+        drawn = f"; drawn for every test: {', '.join(self.random)}" if self.random else ""
+        return f"HiddenEffect {self.variant.label}: {named}{drawn}"
+
+    @property
+    def strength(self) -> float:
+        """The amplitude, or the middle of the plausible range."""
+        return self.variant.typical if self.amplitude is None else self.amplitude
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Amplitude and nuisance parameters by name, as given or the variant's own."""
+        middle = {n.name: n.middle for n in self.variant.nuisances}
+        return {self.variant.parameter: self.strength, **middle, **self.nuisance}
+
+    def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
+        """The effect of every test: one whose every field has a leading axis N, and its parameters by name, shape (N,).
+
+        Each effect of a campaign has its own stream of draws, by the campaign's seed and its place among them.
+        """
+        values = {name: np.full(count, value) for name, value in self.numbers.items()}
+        for i, name in enumerate(self.random):
+            # A stream for each test: adding one leaves the others as they were.
+            sources = np.random.SeedSequence([seed, _STREAM, place, i]).spawn(count)
+            streams = [np.random.default_rng(source) for source in sources]
+            if name == self.variant.parameter:
+                values[name] = self.strength * np.array([rng.standard_normal() for rng in streams])
+            else:  # between the ends of the grid where it is positive, as far as is plausible otherwise
+                nuisance = next(n for n in self.variant.nuisances if n.name == name)
+                low, high = nuisance.plausible
+                share = np.array([rng.random() for rng in streams])
+                if low > 0:
+                    low, high = min(nuisance.grid), max(nuisance.grid)
+                    values[name] = low * (high / low) ** share
+                else:
+                    values[name] = low + (high - low) * share
+
+        def build(numbers: dict[str, Array]) -> AbstractEffect:
+            return self.variant.build(numbers.pop(self.variant.parameter), **numbers)
+
+        arrays = {name: jnp.asarray(drawn, dtype=float) for name, drawn in values.items()}
+        return eqx.filter_vmap(build)(arrays), values
+
+    @property
+    def random(self) -> tuple[str, ...]:
+        """Names of the parameters that every test draws for itself."""
+        names = [self.variant.parameter] if self.variant.random_per_test else []
+        names += [n.name for n in self.variant.nuisances if n.random_per_test and n.name not in self.nuisance]
+        return tuple(names)
+
+    def describe(self) -> dict[str, Any]:
+        """For the campaign's metadata."""
+        drawn = [name for name in self.random if name != self.variant.parameter]
+        return {
+            "mechanism": self.variant.mechanism,
+            "variant": self.variant.name,
+            **{name: float(value) for name, value in self.numbers.items() if name not in drawn},
+            "random_per_test": list(self.random),
+        }
+
+
+def read_effect(text: str) -> HiddenEffect:
+    """An effect as text: `mechanism[:variant][=amplitude][,parameter=value...]`; `InputError` names valid choices."""
+    head, *rest = text.split(",")
+    name, equals, value = head.partition("=")
+    variant = find_variant(name.strip())
+    numbers: dict[str, float] = {}
+    for part in [f"{variant.parameter}={value}", *rest] if equals else rest:
+        key, _, value = (piece.strip() for piece in part.partition("="))
+        if key in numbers:
+            raise InputError(f"{key} is given twice")
+        try:
+            numbers[key] = float(value)
+        except ValueError:
+            raise InputError(f"{part.strip()!r} is not parameter=number") from None
+    return HiddenEffect(variant, numbers.pop(variant.parameter, None), numbers)
+
 
 PAPER_PEAK_STRESS_MPA = (7.0, 16.0)
 """Range of the maximum stress of the paper's tests [MPa]; the value of each particle is not published."""
@@ -117,39 +226,29 @@ def simulate_campaign(
         effects: what acts in addition to the law; strengths that differ from test to test are drawn with the seed,
             and are in `columns`.
         relative_humidity_percent: of the room during each test, shape (N,); it becomes a column.
-        seed: seed of the read-out's noise and of the effects. Each particle has a stream of its own: adding one leaves
-            the others as they were.
+        seed: seed of the read-out's noise and of the effects. Each particle has its own stream: adding one leaves the
+            others as they were.
         provenance: for the campaign's metadata.
 
     Returns:
         A campaign; the true coefficients, and whether each law is monotone, are in its `columns`.
 
     Raises:
-        InputError: for sizes or peaks that are not positive, or arguments of the wrong kind.
-        ValueError: if lengths disagree, an effect of humidity gets no humidities, or the law refuses a particle
-            (`RESULTS` says why).
+        InputError: for arguments that are unfit, or if the law refuses a particle (`RESULTS` says why).
     """
-    if jnp.ndim(laws.plastic.C1) != 1:
-        raise InputError("laws has no leading axis", remedy="Make one law for each with mcc_jax.simulate.law_for_each.")
     instrument = Instrument() if instrument is None else instrument
     seed = arguments.seed(seed)
-    effects = hidden_effects(effects)
+    effects = (effects,) if isinstance(effects, HiddenEffect) else tuple(effects)
     diameters_um = arguments.diameters(diameters_um)
     peaks = arguments.floats(peaks, "peaks", shape="the peak of every particle, shape (N,)")
-    if peaks.ndim != 1 or not peaks.size:
-        raise InputError(f"peaks must be the peak of every particle, shape (N,), got the shape {peaks.shape}")
     arguments.positive(peaks, "peaks [mN or um]")
-    if relative_humidity_percent is not None:
-        relative_humidity_percent = humidities_of(relative_humidity_percent, len(diameters_um))
     count = len(diameters_um)
-    if isinstance(particles, str):
-        raise InputError(f"particles must be a list of names, got the text {particles!r}")
     names = tuple(str(i + 1) for i in range(count)) if particles is None else tuple(particles)
-    if not (len(names) == len(peaks) == count == laws.plastic.C1.shape[0]):
-        raise InputError(
-            f"{count} particles need as many names ({len(names)}), peaks ({len(peaks)}) "
-            f"and laws ({laws.plastic.C1.shape[0]})"
-        )
+    if not (peaks.shape == laws.plastic.C1.shape == (count,) == (len(names),)):
+        shapes = f"{len(names)} names, peaks of shape {peaks.shape} and laws of shape {laws.plastic.C1.shape}"
+        remedy = "Make one law for each with mcc_jax.simulate.law_for_each."
+        raise InputError(f"{count} particles need as many names, peaks and laws, got {shapes}", remedy=remedy)
+    humidity = _humidity(relative_humidity_percent, effects, count)
     samples = [programme.sample(float(peak)) for peak in peaks]
     longest = max(len(time) for time, _ in samples)
     longest += -longest % 64  # programmes of similar length share one compilation
@@ -159,26 +258,20 @@ def simulate_campaign(
         for rows in zip(*samples, strict=True)
     )
     drawn = [effect.draw(seed, i, count) for i, effect in enumerate(effects)]
-    humidity = relative_humidity_percent
-    if humidity is None:
-        for effect in effects:
-            if Need.HUMIDITY_COLUMN in effect.variant.needs:
-                name = effect.variant.mechanism
-                raise InputError(f"the effect {name} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
-        humidity = np.full(count, REFERENCE_HUMIDITY_PERCENT)
     acting = laws.with_effects(*(effect for effect, _ in drawn))
+    batch = particle_batch(diameters_um)
     response = simulate_batch(
         acting,
-        particle_batch(diameters_um),
+        batch,
         paths,
         times=times if acting.effects else None,
-        relative_humidity=jnp.asarray(humidity, dtype=float) if acting.effects else None,
+        relative_humidity=humidity if acting.effects else None,
         control=programme.control,
     )
     force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
-        law, particle, one = jax.tree.map(lambda x: x[bad[0]], (acting, particle_batch(diameters_um), response))
+        law, particle, one = jax.tree.map(lambda x: x[bad[0]], (acting, batch, response))
         raise refusal(law, particle, one, f"particle {names[bad[0]]!r}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(count)]
     curves = [
@@ -192,29 +285,43 @@ def simulate_campaign(
         truth |= {f"{mechanisms[i]}{mark}_{name}": values[name] for name in effect.random}
     numbers = {f"true_{name}": values for name, values in truth.items()}
     if relative_humidity_percent is not None:
-        numbers[HUMIDITY_COLUMN] = relative_humidity_percent
+        numbers[HUMIDITY_COLUMN] = humidity
     columns = {name: tuple(repr(float(v)) for v in np.asarray(values, float)) for name, values in numbers.items()}
     columns["true_monotone"] = tuple("yes" if m else "no" for m in np.asarray(response.monotone))
+    simulation = {
+        "seed": seed,
+        "a": float(np.asarray(laws.a).ravel()[0]),
+        "effective_modulus_MPa": float(np.asarray(laws.effective_modulus).ravel()[0]),
+        "unloading": laws.unloading.value,
+        "strain_scaling": laws.strain_scaling.value,
+        "displacement_noise_um": instrument.displacement_noise_um,
+        "force_noise_mN": instrument.force_noise_mN,
+        "zero_um": instrument.zero_um,
+    }
+    if effects:
+        simulation["effects"] = [effect.describe() for effect in effects]
     metadata = Metadata(
         control=programme.control,
         force_resolution_mN=instrument.force_resolution_mN or None,
         displacement_resolution_um=instrument.displacement_resolution_um or None,
         provenance=provenance,
-        other={
-            "simulation": {
-                "seed": seed,
-                "a": float(np.asarray(laws.a).ravel()[0]),
-                "effective_modulus_MPa": float(np.asarray(laws.effective_modulus).ravel()[0]),
-                "unloading": laws.unloading.value,
-                "strain_scaling": laws.strain_scaling.value,
-                "displacement_noise_um": instrument.displacement_noise_um,
-                "force_noise_mN": instrument.force_noise_mN,
-                "zero_um": instrument.zero_um,
-                **({"effects": [effect.describe() for effect in effects]} if effects else {}),
-            }
-        },
+        other={"simulation": simulation},
     )
     return Campaign(names, np.asarray(diameters_um, float), tuple(curves), columns, metadata)
+
+
+def _humidity(values: Any, effects: Sequence[HiddenEffect], count: int) -> np.ndarray:
+    """Relative humidity of every test [%], shape (N,): the reference where none is given and no effect needs it."""
+    if values is None:
+        needs = [effect.variant.mechanism for effect in effects if Need.HUMIDITY_COLUMN in effect.variant.needs]
+        if needs:
+            raise InputError(f"the effect {needs[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
+        return np.full(count, REFERENCE_HUMIDITY_PERCENT)
+    found = arguments.floats(values, HUMIDITY_COLUMN, shape="one number from 0 to 100 for every test")
+    if found.shape != (count,) or not ((found >= 0) & (found <= 100)).all():
+        must = f"{count} numbers from 0 to 100, one for every test"
+        raise InputError(f"{HUMIDITY_COLUMN} must be {must}, got {arguments.shown(found.tolist())}")
+    return found
 
 
 def paper_campaign(
@@ -245,25 +352,18 @@ def paper_campaign(
         peak_stress_MPa: range of the maximum stress [MPa].
         effects: what acts in addition to the law.
         relative_humidity_percent: of the room during each test [%], shape (20,).
-
-    Raises:
-        InputError: for an argument of the wrong kind or out of its range.
     """
     seed = arguments.seed(seed)
-    shared_material = arguments.flag(shared_material, "shared_material")
     programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme
     instrument = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05) if instrument is None else instrument
-    unloading = arguments.member(unloading, Unloading, "unloading")
-    strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
     between = arguments.floats(peak_stress_MPa, "peak_stress_MPa", shape="two stresses [MPa], the smaller first")
     if between.shape != (2,) or not (0 < between[0] <= between[1] < np.inf):
         raise InputError(f"peak_stress_MPa must be two stresses > 0, the smaller first, got {between.tolist()}")
     count = len(PAPER_DIAMETERS_UM)
     plastic = draw_plastic(count, seed, shared=shared_material)
     laws = law_for_each(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
-    peaks = peaks_at_stress(
-        laws, particle_batch(PAPER_DIAMETERS_UM), draw_evenly(between, count, seed), programme.control
-    )
+    stress = draw_evenly(between, count, seed)
+    peaks = peaks_at_stress(laws, particle_batch(PAPER_DIAMETERS_UM), stress, programme.control)
     return simulate_campaign(
         laws,
         PAPER_DIAMETERS_UM,

@@ -19,8 +19,6 @@ from ..effects import AbstractModulusAtPeak
 from ..geometry import Particle
 from ..law import AbstractContactLaw, MccLaw
 
-CONTROLS: tuple[Control, ...] = get_args(Control)
-
 
 class Response(eqx.Module):
     """Response of a particle along a path.
@@ -55,33 +53,26 @@ def drive(
     """Drive one particle along a path of displacements [um] or forces [mN].
 
     A particle whose damage or densification would let it gain energy somewhere up to the largest strain of the path is
-    refused (`MccLaw.gain_strain`).
-
-    Batch it with `equinox.filter_vmap` over law, particle and path, or use `simulate_batch`.
+    refused (`MccLaw.gain_strain`). The numbers are differentiable with respect to law, particle, path and state.
 
     Args:
         law: any contact law, with or without effects.
-        particle: size and shape.
-        path: what the instrument imposes, displacements [um] or forces [mN]; negative values are out of contact. A
-            list, a Series or an array with one axis.
+        particle: size and shape; several at once: `simulate_batch`, or `equinox.filter_vmap`.
+        path: what the instrument imposes, displacements [um] or forces [mN], shape (n,); negative values are out of
+            contact.
         time: times [s] of the path; a law with effects needs them, others know no time.
         control: which of the two `path` is, "displacement" or "load".
         state: the state to start from; a virgin particle if None.
         throw: raise if the result is not successful; otherwise hand the reason back in `result`. Pass False inside a
             sampler's model or a solver, which may propose parameters without sense: raised there, it ends the run.
 
-    Returns:
-        The response; its numbers are differentiable with respect to law, particle, path and state.
-
     Raises:
-        InputError: for a control that does not exist, a path that is none, times that are not as many as its points; if
-            a law with effects gets no times, or one without effects gets some; with `throw`, naming effects and strain,
-            if the particle would gain energy.
+        InputError: for arguments that are unfit; with `throw`, naming effects and strain, if the particle would gain
+            energy.
         EquinoxRuntimeError: with `throw`, if anything in the response is not finite or the particle can carry no
             stress; within compiled code also if the particle would gain energy.
     """
-    arguments.choice(control, CONTROLS, "control")
-    arguments.flag(throw, "throw")
+    arguments.choice(control, get_args(Control), "control")
     path = arguments.path(path, "path", many="Several particles at once: simulate_batch, or equinox.filter_vmap.")
     if jnp.ndim(particle.D3):
         raise InputError("the particle has a batch axis", remedy="Several at once: simulate_batch.")
@@ -112,17 +103,14 @@ def refusal(law: AbstractContactLaw, particle: Particle, response: Response, nam
 
 @eqx.filter_jit
 def _drive(
-    law: AbstractContactLaw, particle: Particle, path: Path, time: Path | None, control: Control, state: Any
+    law: Any, particle: Particle, path: Path, time: Path | None, control: Control, state: Any, humidity: Any = None
 ) -> Response:
     """The compiled part of `drive`, its arguments checked."""
-    start = law.init(particle) if state is None else state
-    times = () if time is None else (time,)
-    if control == "load":
-        force = path
-        end, displacement = law.path_load(particle, start, path, *times)
-    else:
-        displacement = path
-        end, force = law.path(particle, start, path, *times)
+    if state is None:
+        state = law.init(particle) if humidity is None else law.init(particle, humidity)
+    driven = law.path_load if control == "load" else law.path
+    end, answer = driven(particle, state, path) if time is None else driven(particle, state, path, time)
+    displacement, force = (answer, path) if control == "load" else (path, answer)
     finite = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(force))
     passive = jnp.isinf(law.gain_strain(particle, end))
     result = RESULTS.where(passive, RESULTS.successful, RESULTS.gains_energy)
@@ -130,6 +118,9 @@ def _drive(
     result = RESULTS.where(law.carries_stress(particle), result, RESULTS.no_stress)
     result = RESULTS.where(law.is_valid, result, RESULTS.bad_parameter)
     return Response(displacement, force, law.is_monotone, end, result)
+
+
+_drive_each = eqx.filter_jit(eqx.filter_vmap(_drive))
 
 
 def simulate_batch(
@@ -143,6 +134,8 @@ def simulate_batch(
 ) -> Response:
     """`drive` for N particles at once, each with its own law.
 
+    What the law makes of its parameters never raises: look at `result` and `monotone`.
+
     Args:
         laws: a law whose every array field has a leading axis N.
         particles: a particle, likewise.
@@ -152,26 +145,31 @@ def simulate_batch(
         control: "displacement" or "load".
 
     Returns:
-        A response with a leading axis N in every field; what the law makes of its parameters never raises,
-        look at `result` and `monotone`.
-
-    Raises:
-        InputError: for a control that does not exist, or laws, particles, paths, times and humidities that are not as
-            many.
+        A response with a leading axis N in every field.
     """
-    arguments.choice(control, CONTROLS, "control")
+    arguments.choice(control, get_args(Control), "control")
     _check_times(laws, times is not None, "times")
     if relative_humidity is not None and not getattr(laws, "effects", ()):
         raise InputError("only laws with effects know humidities", remedy="Leave out relative_humidity.")
-    paths = _rows(paths, "paths", 2)
-    if times is not None:
-        times = _rows(times, "times", 2)
-        if times.shape != paths.shape:
-            raise InputError(f"times have the shape {times.shape} and paths {paths.shape}: they must be as many")
-    if relative_humidity is not None:
-        relative_humidity = _rows(relative_humidity, "relative_humidity", 1)
-    _check_count(len(paths), laws=laws, particles=particles, relative_humidity=relative_humidity)
-    return _simulate_batch(laws, particles, paths, times, relative_humidity, control)
+    paths = arguments.values(paths, "paths", shape="an array of shape (N, steps)")
+    if paths.ndim != 2 or paths.size == 0:
+        remedy = "For one particle take drive." if paths.ndim < 2 else None
+        raise InputError(f"paths must have the shape (N, steps), got {paths.shape}", remedy=remedy)
+    times = None if times is None else arguments.values(times, "times")
+    humidity = None if relative_humidity is None else arguments.values(relative_humidity, "relative_humidity")
+    count = paths.shape[:1]
+    for name, batch, shape in (
+        ("laws", laws, count),
+        ("particles", particles, count),
+        ("times", times, paths.shape),
+        ("relative_humidity", humidity, count),
+    ):
+        for leaf in jax.tree.leaves(eqx.filter(batch, eqx.is_array)):
+            if leaf.shape[: len(shape)] != shape:
+                problem = f"paths have the shape {paths.shape}, and an array of {name} has {leaf.shape}"
+                remedy = "Make a batch with equinox.filter_vmap, for instance mcc_jax.simulate.law_for_each."
+                raise InputError(f"{problem}: they must be as many", remedy=remedy)
+    return _drive_each(laws, particles, paths, times, control, None, humidity)
 
 
 def _check_times(law: AbstractContactLaw, given: bool, name: str) -> None:
@@ -181,40 +179,3 @@ def _check_times(law: AbstractContactLaw, given: bool, name: str) -> None:
     if given:
         raise InputError("only a law with effects knows times", remedy=f"Leave out {name}.")
     raise InputError("a law with effects needs the times of its path", remedy=f"Pass {name}=[...] in seconds.")
-
-
-def _rows(values: Any, name: str, axes: int) -> Array:
-    shape = "shape (N, steps), N and steps at least 1" if axes == 2 else "shape (N,)"
-    array = arguments.values(values, name, shape=shape)
-    if array.ndim != axes or array.size == 0:
-        remedy = "For one particle take drive." if array.ndim < axes else None
-        raise InputError(f"{name} must have the {shape}, got {array.shape}", remedy=remedy)
-    return array
-
-
-def _check_count(count: int, **batches: Any) -> None:
-    """Refuse batches whose leading axis is another."""
-    for name, batch in batches.items():
-        for leaf in jax.tree.leaves(batch):
-            if eqx.is_array(leaf) and jnp.shape(leaf)[:1] != (count,):
-                has = f"{leaf.shape[0]} entries" if leaf.ndim else "no leading axis"
-                remedy = "Make a batch with equinox.filter_vmap, for instance mcc_jax.simulate.law_for_each."
-                raise InputError(f"there are {count} paths and {name} with {has}: they must be as many", remedy=remedy)
-
-
-@eqx.filter_jit
-def _simulate_batch(
-    laws: AbstractContactLaw,
-    particles: Particle,
-    paths: Array,
-    times: Array | None,
-    relative_humidity: Array | None,
-    control: Control,
-) -> Response:
-    """The compiled part of `simulate_batch`, its arguments checked."""
-
-    def one(law: Any, particle: Particle, path: Array, time: Array | None, humidity: Array | None) -> Response:
-        start = law.init(particle) if humidity is None else law.init(particle, humidity)
-        return drive(law, particle, path, time=time, control=control, state=start, throw=False)
-
-    return eqx.filter_vmap(one)(laws, particles, paths, times, relative_humidity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -22,17 +22,14 @@ class Ramp:
     Attributes:
         to: level as a share of the particle's peak; 1 is the peak, 0 full release.
         rate: magnitude of the rate, mN/s under load control, um/s under displacement control, > 0.
-
-    Raises:
-        InputError: for a rate that is not positive, or a negative level.
     """
 
     to: float
     rate: float
 
     def __post_init__(self) -> None:
-        to = arguments.number(self.to, "the level that a ramp goes to, a share of the peak,", least=0)
-        object.__setattr__(self, "to", to)
+        level = "the level that a ramp goes to, a share of the peak,"
+        object.__setattr__(self, "to", arguments.number(self.to, level, least=0))
         object.__setattr__(self, "rate", arguments.number(self.rate, "the rate of a ramp", above=0))
 
 
@@ -42,9 +39,6 @@ class Hold:
 
     Attributes:
         seconds: how long [s], > 0.
-
-    Raises:
-        InputError: for a duration that is not positive.
     """
 
     seconds: float
@@ -64,9 +58,6 @@ class Programme:
         steps: the ramps and holds.
         interval_s: time between two samples [s]; particles then get curves of unequal length.
         points: number of samples, evenly spread over the time of the test (the turning points come on top).
-
-    Raises:
-        InputError: for a control that does not exist, a sampling that is not positive, or no steps.
     """
 
     control: Control
@@ -87,17 +78,16 @@ class Programme:
         object.__setattr__(self, "steps", tuple(self.steps))
 
     def __repr__(self) -> str:
-        unit, sampling = ("mN/s" if self.control == "load" else "um/s"), f"every {self.interval_s} s"
-        if self.points is not None:
-            sampling = f"{self.points} samples"
-        shown = [
+        unit = "mN/s" if self.control == "load" else "um/s"
+        sampling = f"every {self.interval_s} s" if self.points is None else f"{self.points} samples"
+        steps = [
             f"hold {number(step.seconds)} s"
             if isinstance(step, Hold)
             else f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"
             for step in self.steps
         ]
-        title = f"Programme under control of {self.control}, {sampling}"
-        return table(title, [(str(i), text) for i, text in enumerate(shown, start=1)])
+        rows = [(str(i), text) for i, text in enumerate(steps, start=1)]
+        return table(f"Programme under control of {self.control}, {sampling}", rows)
 
     @classmethod
     def cycles(
@@ -139,13 +129,9 @@ class Programme:
         return cls(control, tuple(steps), interval_s, points)
 
     def sample(self, peak: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s] and target values (mN or um) for a particle whose peak is `peak`.
+        """Times [s], strictly increasing, and target values (mN or um) for a particle whose peak is `peak`.
 
-        Returns:
-            Two arrays of one length; times increase strictly.
-
-        Raises:
-            InputError: for a peak that is not positive, or a programme that never leaves zero.
+        A programme that never leaves zero raises `InputError`.
         """
         peak = arguments.number(peak, "the peak of a particle [mN or um]", above=0)
         times, values = [0.0], [0.0]
@@ -180,9 +166,6 @@ class Instrument:
         displacement_resolution_um: smallest step of displacement [um]; 0 for none.
         force_resolution_mN: smallest step of force [mN]; 0 for none.
         zero_um: standard deviation of each test's zero of displacement [um]: where the instrument found contact.
-
-    Raises:
-        InputError: for a value that is negative or not finite.
     """
 
     displacement_noise_um: float = 0.0
@@ -233,37 +216,34 @@ def read_programme(file: str | Path) -> Programme:
         InputError: naming the file and the entry.
     """
     file = arguments.file_path(file, "file")
-    content = load_toml_file(file, "a TOML file with the programme")
-    steps: list[Ramp | Hold] = []
+    entries = load_toml_file(file, "a TOML file with the programme")
+    known = ("control", "rate", "points", "interval_s", "step")
     where = "the programme"
     try:
-        _only(content, ("control", "rate", "points", "interval_s", "step"), where)
-        entries = content.get("step")
-        if not isinstance(entries, list) or not entries:
+        for key in entries.keys() - set(known):
+            raise InputError(f"unknown entry {key!r}", remedy=f"Known: {', '.join(known)}.")  # noqa: TRY301
+        if not isinstance(entries.get("step"), list):
             raise InputError("has no [[step]]")  # noqa: TRY301
-        for i, entry in enumerate(entries, start=1):
+        steps: list[Ramp | Hold] = []
+        for i, entry in enumerate(entries["step"], start=1):
             where = f"step {i}"
-            if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
-                raise InputError("exactly one of ramp_to and hold_s is needed")  # noqa: TRY301
-            _only(entry, ("ramp_to", "rate", "hold_s"), where)
-            if "hold_s" in entry:
-                steps.append(Hold(arguments.number(entry["hold_s"], "hold_s")))
-                continue
-            rate = entry.get("rate", content.get("rate"))
-            if rate is None:
-                raise InputError("no rate: give it one, or one for all at the top")  # noqa: TRY301
-            steps.append(Ramp(arguments.number(entry["ramp_to"], "ramp_to"), arguments.number(rate, "rate")))
+            steps.append(_step(entry, entries.get("rate")))
         where = "the programme"
-        control = arguments.choice(content.get("control", "load"), get_args(Control), "control")
-        interval_s = arguments.number(content["interval_s"], "interval_s") if "interval_s" in content else None
-        points = content.get("points", 300 if interval_s is None else None)
+        control = arguments.choice(entries.get("control", "load"), get_args(Control), "control")
+        interval_s = arguments.number(entries["interval_s"], "interval_s") if "interval_s" in entries else None
+        points = entries.get("points", 300 if interval_s is None else None)
         return Programme(control, steps, interval_s, None if points is None else arguments.whole(points, "points"))
     except InputError as error:
         remedy = error.remedy or "See the example in `mcc-jax simulate --help`."
         raise InputError(f"{where}: {error.problem}", file=file, remedy=remedy) from None
 
 
-def _only(entries: dict, known: tuple[str, ...], where: str) -> None:
-    for key in entries:
-        if key not in known:
-            raise InputError(f"unknown entry {key!r}", remedy=f"Known in {where}: {', '.join(known)}.")
+def _step(entry: Any, rate: Any) -> Ramp | Hold:
+    """A step of a programme's file."""
+    match entry:
+        case {"ramp_to": to, **rest} if rest.keys() <= {"rate"}:
+            rate = arguments.number(rest.get("rate", rate), "rate, of the step or of all at the top,")
+            return Ramp(arguments.number(to, "ramp_to"), rate)
+        case {"hold_s": seconds} if len(entry) == 1:
+            return Hold(arguments.number(seconds, "hold_s"))
+    raise InputError("must have ramp_to and perhaps rate, or hold_s alone")

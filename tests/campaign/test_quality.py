@@ -1,4 +1,4 @@
-"""What instruments do to tests is found, corrected where the record allows, and told; honest tests stay as they are."""
+"""What instruments do to tests is found, corrected where the record allows, and reported; sound tests stay."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from faulty import exact, noisy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax.campaign import Curve, Finding, campaign_findings, check_tests
+from mcc_jax.campaign import Finding, campaign_findings, check_tests
 from mcc_jax.campaign.findings import worst
 from mcc_jax.campaign.force_zero import open_zero
 
@@ -25,17 +25,11 @@ def only(campaign, check):
     return checked, found
 
 
-def same(one, other):
-    return all(
-        np.array_equal(getattr(one, name), getattr(other, name)) for name in ("time_s", "force_mN", "displacement_um")
-    )
-
-
-# ---- honest tests ----------------------------------------------------------------------------------------------------
+# ---- sound tests -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_an_honest_campaign_without_air_readings_stays_what_it_is(seed):
+def test_a_sound_campaign_without_air_readings_stays_what_it_is(seed):
     campaign = noisy(exact(), seed)
     checked = check_tests(campaign)
     assert campaign_findings(checked) == ()
@@ -45,11 +39,9 @@ def test_an_honest_campaign_without_air_readings_stays_what_it_is(seed):
 
 @pytest.mark.parametrize(("step_mN", "step_um"), [(0.5, 0.0), (5.0, 0.0), (0.0, 0.1), (0.0, 1.0), (2.0, 0.5)])
 def test_a_coarse_read_out_is_no_fault(step_mN, step_um):
-    def to(values, step):
-        return step * np.round(values / step) if step else values
-
-    def rounded(time, force, path):
-        return time, to(force, step_mN), to(path, step_um)
+    def rounded(time, *channels):
+        steps = zip(channels, (step_mN, step_um), strict=True)
+        return time, *(step * np.round(values / step) if step else values for values, step in steps)
 
     checked = check_tests(faulty.changed(noisy(exact(), 3), rounded))
     assert campaign_findings(checked) == ()
@@ -94,10 +86,10 @@ def test_the_zero_of_force_in_the_air_is_taken_off_with_its_error(seed, offset_m
         alone = 0.05 / np.sqrt(readings)
         assert 0.4 * alone < kept.force_zero_sd_mN < 4 * alone
         assert abs(kept.force_zero_mN - offset_mN) < 5 * kept.force_zero_sd_mN
-    told = [one for one in campaign_findings(checked) if one.check == "zero of force"]
-    assert bool(told) or abs(offset_mN) < 1
-    assert worst(told) in (None, "info")
-    assert all("before contact; this was taken off" in one.sentence for one in told)
+    found = campaign_findings(checked)
+    assert found or abs(offset_mN) < 1
+    assert worst(found) in (None, "info")
+    assert all("before contact; this was taken off" in one.sentence for one in found)
 
 
 def test_an_offset_is_reported_with_its_size():
@@ -113,9 +105,9 @@ def test_an_offset_that_no_answer_can_feel_is_taken_off_without_a_word():
     assert all(abs(curve.checked.force_zero_mN - 0.1) < 0.05 for curve in checked.curves)
 
 
-def shifted(campaign, offset_mN):
-    """The tests as a load cell reads them whose zero is off."""
-    return replace(campaign, curves=tuple(replace(c, force_mN=c.force_mN + offset_mN) for c in campaign.curves))
+def shifted(campaign, offset_mN, share=0.0):
+    """The tests as a load cell reads them whose zero is off, begun at a share of the first step of their ramp."""
+    return faulty.changed(campaign, lambda t, F, d: (t, F + offset_mN + share * (F[1] - F[0]), d))
 
 
 def test_a_record_that_begins_below_zero_without_air_was_not_tared():
@@ -144,23 +136,19 @@ def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
 
 @pytest.mark.parametrize("offset_mN", [-10.0, 20.0])
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_tests_of_one_load_cell_tell_its_zero_together(offset_mN, share):
+def test_tests_of_one_load_cell_determine_its_zero_together(offset_mN, share):
     """Every record begins at the same part of the first step of its ramp: the line over steps meets the zero."""
-    campaign = noisy(exact(), 0)
-    later = [
-        replace(c, force_mN=c.force_mN + offset_mN + share * (c.force_mN[1] - c.force_mN[0])) for c in campaign.curves
-    ]
-    checked = check_tests(replace(campaign, curves=tuple(later)))
+    checked = check_tests(shifted(noisy(exact(), 0), offset_mN, share))
     zero = open_zero(checked)[0] if offset_mN > 0 else checked.curves[0].checked.force_zero_mN
     assert abs(zero - offset_mN) < 0.3
     assert len({c.checked and c.checked.force_zero_mN for c in checked.curves} - {None}) == 1
 
 
 def test_tests_that_share_no_zero_are_taken_one_by_one():
-    campaign = noisy(exact(), 0)
-    offsets = np.linspace(-30.0, -5.0, len(campaign.curves))
-    later = [replace(c, force_mN=c.force_mN + o) for c, o in zip(campaign.curves, offsets, strict=True)]
-    checked = check_tests(replace(campaign, curves=tuple(later)))
+    campaign, offsets = noisy(exact(), 0), np.linspace(-30.0, -5.0, 4)
+    for name, offset in zip(campaign.particles, offsets, strict=True):
+        campaign = faulty.changed(campaign, lambda t, F, d, off=offset: (t, F + off, d), only=(name,))
+    checked = check_tests(campaign)
     for curve, offset in zip(checked.curves, offsets, strict=True):
         if curve.checked is not None:  # a small particle's record may begin beyond what is a zero
             assert abs(curve.checked.force_zero_mN - offset) < 0.5
@@ -169,15 +157,13 @@ def test_tests_that_share_no_zero_are_taken_one_by_one():
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_record_that_begins_within_a_step_of_its_ramp_is_not_remarked(share):
-    campaign = noisy(exact(), 0)
-    later = [replace(c, force_mN=c.force_mN + share * (c.force_mN[1] - c.force_mN[0])) for c in campaign.curves]
-    checked = check_tests(replace(campaign, curves=tuple(later)))
+    checked = check_tests(shifted(noisy(exact(), 0), 0.0, share))
     assert campaign_findings(checked) == ()
     assert open_zero(checked) is None
 
 
 @pytest.mark.parametrize("drift_mN", [-20.0, -5.0, 3.0, 8.0])
-def test_a_drift_in_the_air_is_told_with_its_change_as_error(drift_mN):
+def test_a_drift_in_the_air_is_reported_with_its_change_as_error(drift_mN):
     campaign = faulty.in_air(noisy(exact(), 1), drift_mN=drift_mN)
     checked = check_tests(campaign)
     found = campaign_findings(checked)
@@ -249,7 +235,8 @@ def test_a_record_counts_up_to_where_the_particle_broke(seed, at, left):
     raw, curve = campaign.curves[1], checked.curves[1]
     last = int(np.argmax(raw.force_mN >= at * noisy(exact(), seed).curves[1].force_mN.max()))
     assert abs(len(curve) - 1 - last) <= 3
-    assert same(curve, Curve(raw.time_s[: len(curve)], raw.force_mN[: len(curve)], raw.displacement_um[: len(curve)]))
+    for name in ("time_s", "force_mN", "displacement_um"):
+        np.testing.assert_array_equal(getattr(curve, name), getattr(raw, name)[: len(curve)])
 
 
 def test_quick_unloading_is_no_breakage():
@@ -260,8 +247,8 @@ def test_quick_unloading_is_no_breakage():
         rows = np.concatenate([np.arange(top + 1), np.arange(top + 40, len(force), 40)])
         return time[: len(rows)], force[rows], path[rows]
 
-    checked = check_tests(noisy(faulty.changed(exact(), quick), 0))
-    assert not [one for one in campaign_findings(checked) if one.check == "breakage"]
+    found = campaign_findings(check_tests(noisy(faulty.changed(exact(), quick), 0)))
+    assert "breakage" not in [one.check for one in found]
 
 
 @quickly
@@ -323,7 +310,7 @@ def test_a_force_with_the_wrong_sign_is_not_taken_for_a_lost_loading():
 # ---- several faults, and what a checked campaign is ------------------------------------------------------------------
 
 
-def test_faults_of_several_kinds_are_all_told():
+def test_faults_of_several_kinds_are_all_reported():
     campaign = faulty.in_air(noisy(exact(), 4), offset_mN=-15.0)
     campaign = faulty.spiked(campaign, height=1e5, at=150, only=("1",))
     campaign = faulty.broken(campaign, only=("2",))

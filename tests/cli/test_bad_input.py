@@ -173,7 +173,7 @@ COMMAND_LINES = {
     "simulate --out {o} --resolution-mN 1e9": "zero",
     "simulate --out {o} --effect wobble": "Known: frame_compliance, thermal_drift",
     "simulate --out {o} --effect creep:wobble": "it has: kelvin_voigt",
-    "simulate --out {o} --effect creep=-1": "zero or positive",
+    "simulate --out {o} --effect creep=-1": ">= 0",
     "simulate --out {o} --effect creep,tau=3": "it has: creep_compliance_per_MPa, tau_s",
     "simulate --out {o} --effect humidity": "relative_humidity_percent",
 }

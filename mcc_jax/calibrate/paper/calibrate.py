@@ -24,7 +24,7 @@ from ...campaign import (
     of_each_particle,
     particle_batch,
 )
-from ...campaign.reasons import refusal
+from ...campaign.adjustment import refusal
 from ...geometry import plastic_shape_factor
 from ...law import MccLaw, StrainScaling, Unloading
 from ..data import MOST_POINTS, point_noise_um, rows_from_contact
