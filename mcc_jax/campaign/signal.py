@@ -97,9 +97,10 @@ def runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stretches(chosen: np.ndarray) -> list[tuple[int, int]]:
-    """Stretches [start, stop) of consecutive readings that are chosen by booleans of shape (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], chosen, [False])).view(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    """Stretches [start, stop) of consecutive readings that are chosen by booleans of shape (n,), n >= 1."""
+    starts, stops = runs(chosen)
+    first = 0 if chosen[0] else 1  # every other run is chosen
+    return list(zip(starts[first::2].tolist(), stops[first::2].tolist(), strict=True))
 
 
 class Line(NamedTuple):

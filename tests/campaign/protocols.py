@@ -34,57 +34,44 @@ def make_protocol(
 ) -> Protocol:
     """Random turning levels and lengths; ramps are at least a quarter of the range deep."""
     rng = np.random.default_rng(seed)
-    drive: list[np.ndarray] = []
-    creep: list[np.ndarray] = []
-    kinds: list[str] = []
-    rates: list[float] = []
-    level, peak = 0.0, 0.0
+    pieces: list[tuple[str, np.ndarray, np.ndarray, float]] = []  # kind, drive, creep or relaxation, pace of the drive
 
-    def add(kind: str, values: np.ndarray, slip: np.ndarray, rate: float) -> None:
-        drive.append(values)
-        creep.append(slip)
-        kinds.append(kind)
-        rates.append(rate)
+    def go(kind: str, start: float, stop: float) -> None:
+        steps = int(rng.integers(*ramp))
+        drive = start + (stop - start) * np.arange(1, steps + 1) / steps
+        pieces.append((kind, drive, np.zeros(steps), abs(stop - start) / steps))
 
-    def hold(least: float) -> None:
-        count = int(rng.integers(1, 4) * least) + 12
-        at = np.arange(1, count + 1) / count
-        add("hold", np.full(count, level), 0.02 * np.log1p(20 * at) / np.log(21.0), 0.0)
+    def hold(level: float) -> None:
+        count = int(rng.integers(1, 4) * dwell) + 12
+        creep = 0.02 * np.log1p(20 * np.arange(1, count + 1) / count) / np.log(21.0)
+        pieces.append(("hold", np.full(count, level), creep, 0.0))
 
     # A hold must outlast what the noise blurs: `dwell` bands on the slowest ramp that is possible here.
     width = max(0.0025, 4 * np.hypot(noise, resolution / 2))
     slowest = (0.25 if control == "load" else 0.09) / ramp[1]
     dwell = 8 * width / slowest
+    waits = int(rng.integers(1, 4) * 12 * width / slowest + 30) if approach else 0
     if approach:
-        count = int(rng.integers(1, 4) * 12 * width / slowest + 30)
-        add("approach", np.zeros(count), np.zeros(count), 0.0)
+        pieces.append(("approach", np.zeros(waits), np.zeros(waits), 0.0))
+    bottom, peak = 0.0, 0.0
     for cycle in range(cycles):
         last = cycle == cycles - 1
-        lowest = max(level + 0.25, 0.4) if control == "load" else max(0.95 * peak, 0.7)
+        lowest = max(bottom + 0.25, 0.4) if control == "load" else max(0.95 * peak, 0.7)
         top = 1.0 if last else rng.uniform(lowest, 1.0)
         if cycle and top <= peak + 6 * width:
             top = peak
-        steps = int(rng.integers(*ramp))
-        values = level + (top - level) * np.arange(1, steps + 1) / steps
-        rate = (top - level) / steps
-        add("load", values, np.zeros(steps), rate)
-        level, peak = top, max(peak, top)
+        go("load", bottom, top)
+        peak = max(peak, top)
         if holds and rng.random() < 0.6:
-            hold(dwell)
+            hold(top)
         if control == "load":
-            bottom = rng.uniform(0.0, level - 0.25)
+            bottom = rng.uniform(0.0, top - 0.25)
         else:  # never out of contact: the force is zero at three quarters of the peak
-            bottom = 0.75 * peak + (level - 0.75 * peak) * rng.uniform(0.05, 0.3)
-        steps = int(rng.integers(*ramp))
-        add(
-            "unload",
-            level + (bottom - level) * np.arange(1, steps + 1) / steps,
-            np.zeros(steps),
-            (level - bottom) / steps,
-        )
-        level = bottom
-        if holds and level > 0.1 and not last and rng.random() < 0.3:
-            hold(dwell)
+            bottom = 0.75 * peak + (top - 0.75 * peak) * rng.uniform(0.05, 0.3)
+        go("unload", top, bottom)
+        if holds and bottom > 0.1 and not last and rng.random() < 0.3:
+            hold(bottom)
+    kinds, drive, creep, rates = (list(column) for column in zip(*pieces, strict=True))
     if control == "displacement":
         # What relaxed in a hold comes back on the ramp that follows.
         for i in range(1, len(kinds)):
@@ -98,14 +85,14 @@ def make_protocol(
     time = np.cumsum(rng.uniform(0.5, 1.5, count))
     if gaps:
         time += np.cumsum(np.where(rng.random(count) < 0.01, 300.0, 0.0))
-    top_so_far = np.maximum.accumulate(signal)
-    away = _approach_path(kinds, drive)
+    away = np.concatenate([-np.linspace(0.3, 0.0, waits), np.zeros(count - waits)])
+    highest = np.maximum.accumulate(signal)
     if control == "load":
         force = signal
-        displacement = 0.9 * top_so_far**0.7 - 0.15 * (top_so_far - signal) ** 0.9 + slip + away
-    else:
-        displacement = signal + away
-        force = _elastic_plastic(signal) - slip
+        displacement = 0.9 * highest**0.7 - 0.15 * (highest - signal) ** 0.9 + slip + away
+    else:  # elastic unloading, four times steeper
+        elastic = (signal - 0.75 * highest) / np.where(highest > 0, 0.25 * highest, 1.0)
+        force, displacement = highest * np.clip(elastic, -0.02, 1) - slip, signal + away
     starts = np.cumsum([0, *(len(d) for d in drive)]).tolist()
     kinds, starts, rates = _virgin(kinds, starts, rates, force, 3 * width * np.ptp(force))
     force, displacement = (_measure(rng, x, noise, resolution) for x in (force, displacement))
@@ -118,36 +105,21 @@ def _virgin(
     kinds: list[str], starts: list[int], rates: list[float], force: np.ndarray, clear: float
 ) -> tuple[list[str], list[int], list[float]]:
     """Name as reload what does not exceed the force reached before, cutting where it does."""
-    new_kinds, new_starts, new_rates = [], [], []
+    found: list[tuple[str, int, float]] = []
     reached, unloaded = -np.inf, False
     for kind, rate, a, b in zip(kinds, rates, starts, starts[1:], strict=False):
         part = force[a:b]
         if kind == "load" and unloaded:
+            found.append(("reload", a, rate))
             cut = int(np.argmax(part > reached)) if part.max() > reached + clear else len(part)
-            pieces = [("reload", a)] + ([("load", a + cut)] if cut < len(part) - 1 else [])
+            if cut < len(part) - 1:
+                found.append(("load", a + cut, rate))
         else:
-            pieces = [(kind, a)]
-        for name, start in pieces:
-            new_kinds.append(name)
-            new_starts.append(start)
-            new_rates.append(rate)
+            found.append((kind, a, rate))
         unloaded = unloaded or kind == "unload"
         reached = max(reached, part.max())
+    new_kinds, new_starts, new_rates = (list(column) for column in zip(*found, strict=True))
     return new_kinds, new_starts, new_rates
-
-
-def _approach_path(kinds: list[str], drive: list[np.ndarray]) -> np.ndarray:
-    path = np.zeros(sum(map(len, drive)))
-    if kinds[0] == "approach":
-        path[: len(drive[0])] = -np.linspace(0.3, 0.0, len(drive[0]))
-    return path
-
-
-def _elastic_plastic(displacement: np.ndarray) -> np.ndarray:
-    """Force of a test under displacement control whose unloading is elastic and four times steeper."""
-    rest = 0.75 * np.maximum.accumulate(displacement)
-    top = np.maximum.accumulate(displacement)
-    return np.where(top > 0, top * np.clip((displacement - rest) / np.where(top > 0, top - rest, 1.0), -0.02, 1), 0.0)
 
 
 def _measure(rng: np.random.Generator, values: np.ndarray, noise: float, resolution: float) -> np.ndarray:
