@@ -21,8 +21,7 @@ import mcc_jax as mcc
 from mcc_jax._format import plain
 from mcc_jax.discovery import discover
 from mcc_jax.effects import find_variant
-from mcc_jax.report.pictures import draw_enlarged, draw_left_over
-from mcc_jax.report.story import most_informative_test
+from mcc_jax.report.story import draw_enlarged, draw_left_over, most_informative_test
 
 FOLDER = Path(__file__).parent / "pages" / "images"
 BLUE, VERMILION, ORANGE, GREY = "#0072B2", "#D55E00", "#E69F00", "0.45"

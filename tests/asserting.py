@@ -6,6 +6,12 @@ def snapshot(folder):
     return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in sorted(folder.rglob("*"))}
 
 
+def done(result):
+    """Assert exit status 0 and a quiet standard error; what was printed."""
+    assert (result.exit_code, result.stderr) == (0, ""), (result.stdout, result.stderr, result.exception)
+    return result.stdout
+
+
 def refused(result):
     """Assert one clear line on standard error and exit status 2; the line."""
     assert result.exit_code == 2, (result.stdout, result.stderr, result.exception)

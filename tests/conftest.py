@@ -141,7 +141,7 @@ def _commands_are_quiet():
         yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def run():
     """The command line, in this process: `run("calibrate", folder, "--out", out)`."""
     from click.testing import CliRunner

@@ -122,8 +122,8 @@ def unknown_modulus(campaign: Campaign, modulus: Mapping[str, Any]) -> Finding |
     why, remedy = ": too little of their unloading can be compared with the law", UNLOAD
     for channel in ("force", "displacement"):
         if (end := found.get(f"{channel} range")) is not None:
-            why, remedy = f": {channel} stands at the end of its range where they unload", end.remedy
-    return Finding(MODULUS_OPEN, "warning", f"The tests do not tell the modulus{between}{why}", remedy)
+            why, remedy = f": {channel} is at the end of its range where they unload", end.remedy
+    return Finding(MODULUS_OPEN, "warning", f"The tests do not determine the modulus{between}{why}", remedy)
 
 
 def is_unknown(modulus: Mapping[str, Any]) -> bool:

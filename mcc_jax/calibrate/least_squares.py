@@ -132,7 +132,7 @@ class LeastSquares(JointCalibration):
             notes.append("one particle says nothing of the scatter between particles: no spread is given")
         elif np.any(np.asarray(self.settings.population.tau) < 1e-3):
             small = [n for n, t in zip(COEFFICIENTS, np.asarray(self.settings.population.tau), strict=True) if t < 1e-3]
-            notes.append(f"the spread of {', '.join(small)} cannot be told from zero")
+            notes.append(f"the spread of {', '.join(small)} cannot be distinguished from zero")
         return notes
 
     def answer(self) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class Model:
         names = [v.mechanism for v in chosen]
         for name in names:
             if names.count(name) > 1:
-                raise InputError(f"{name} stands twice in one model", remedy="Take one formula of each mechanism.")
+                raise InputError(f"{name} appears twice in one model", remedy="Take one formula of each mechanism.")
         differ = tuple(dict.fromkeys([*_several(varying), *(v.mechanism for v in chosen if v.random_per_test)]))
         for name in differ:
             arguments.choice(name, names, "effect to vary")

@@ -156,7 +156,7 @@ class Posterior(JointCalibration):
             )
         flat = np.asarray(self.selection.tests.flatness)
         if np.ptp(flat) < 0.02:
-            notes.append("all particles have the same shape: nothing here tells a from C1, C3, C5; a is its prior")
+            notes.append("all particles have the same shape, which does not determine a: a is its prior")
         share = float(np.mean(self.probability_not_monotone()))
         if share > 0.05:
             notes.append(f"{100 * share:.0f} % of new particles would have a law that is not monotone (snap-through)")

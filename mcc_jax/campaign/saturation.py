@@ -40,13 +40,13 @@ and 85 % the intervals of the modulus hold the truth; farther on nobody has look
 FORCE_RANGE = Finding(
     "saturation",
     "warning",
-    "force stands at {} mN, the end of its range, for {} readings, which are left out",
+    "force stays at {} mN, the end of its range, for {} readings, which are left out",
     "Measure with a load cell of a larger range",
     code="force range",
 )
 TURNING_POINT = replace(
     FORCE_RANGE,
-    sentence="force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out "
+    sentence="force stays at {} mN, the end of its range, for {} readings while the platens go on; they are left out "
     "and the turning point is taken from the displacement ({} +- {} mN)",
 )
 FAR_BEYOND = replace(
@@ -55,7 +55,7 @@ FAR_BEYOND = replace(
 DISPLACEMENT_RANGE = Finding(
     "saturation",
     "warning",
-    "displacement stands at {} um, the end of its range, for {} readings while the force goes on; they are not "
+    "displacement stays at {} um, the end of its range, for {} readings while the force goes on; they are not "
     "compared with the law",
     "Measure with a larger range of displacement",
     code="displacement range",

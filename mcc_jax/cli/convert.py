@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from .._store import results
 from . import options as common
-from .session import say, say_next, say_table, session
+from .session import say, say_next, session
 
-SHOWN = 12
-"""Rows of the table of tests; a folder may hold hundreds."""
 KINDS = ("approach", "load", "hold", "unload", "reload")
 
 
 @click.command(short_help="Turn an instrument's file, or a folder of them, into a campaign.")
 @click.argument("file", type=common.Location(), metavar="FILE|FOLDER")
 @common.out(required=True)
-@click.option(
-    "--diameters",
-    metavar="D1,D2,D3|FILE",
-    help="Diameters in um of all tests, or a table (CSV or xlsx) with particle,D1_um,D2_um,D3_um, in which particles "
-    "are called like tests or files; D3 lies along the compression.",
+@common.diameters(
+    "Diameters in um of all tests, or a table (CSV or xlsx) with particle,D1_um,D2_um,D3_um, in which particles are "
+    "called like tests or files; D3 lies along the compression."
 )
 @click.option(
     "--mapping",
@@ -42,10 +37,8 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
     metavar="NAME",
     help='A file of FOLDER to leave out; may hold "*" and "?"; repeatable.',
 )
-@common.seed("Recorded in campaign.toml; converting itself draws no random number.")
-def convert(
-    file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...], seed: int
-) -> None:
+@common.no_seed
+def convert(file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...]) -> None:
     """Turn FILE, an instrument's export, or all exports of FOLDER into a campaign.
 
     Known formats: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip, recognised by
@@ -73,11 +66,8 @@ def convert(
       [diameters]                   # if a row above the samples gives the diameter
       header = "Gage length"
     """
-    if diameters is not None and not diameters.strip():
-        raise click.BadParameter("it is empty.", param_hint="--diameters")
     with session(3) as progress:
-        import numpy as np
-
+        from .._format import span
         from ..campaign import (
             campaign_findings,
             check_plausibility,
@@ -94,30 +84,18 @@ def convert(
         skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
         campaign = read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=skip)
         progress("finding the segments")
-        segments = [Counter(part.kind for part in find_segments(curve)) for curve in campaign.curves]
+        segments = Counter(part.kind for curve in campaign.curves for part in find_segments(curve))
         progress("writing")
-        conversion = campaign.metadata.other.get("conversion", {})
-        other = {**campaign.metadata.other, "conversion": {"seed": seed, **conversion}}
         with results(out) as stage:
-            write_campaign(replace(campaign, metadata=replace(campaign.metadata, other=other)), stage.folder)
+            write_campaign(campaign, stage.folder)
     points = sum(len(curve) for curve in campaign.curves)
     source = (campaign.metadata.provenance or "").partition(";")[0]
     say(f"{len(campaign)} test{'s' if len(campaign) > 1 else ''}, {points} points ({source}).")
-    peaks = [(curve.force_mN.max(), curve.displacement_um.max()) for curve in campaign.curves]
-    rows = [
-        (name, str(len(curve)), *(f"{peak:.4g}" for peak in of), *(str(found[kind]) for kind in KINDS))
-        for name, curve, of, found in zip(campaign.particles, campaign.curves, peaks, segments, strict=True)
-    ]
-    say_table(("test", "points", "max force mN", "max displ um", *KINDS), rows[:SHOWN])
-    if len(rows) > SHOWN:
-        (force, displacement), (most_force, farthest) = np.min(peaks, axis=0), np.max(peaks, axis=0)
-        say(
-            f"  ... and {len(rows) - SHOWN} more; in all, max force {force:.4g} to {most_force:.4g} mN, "
-            f"max displ {displacement:.4g} to {farthest:.4g} um"
-        )
-    total = sum(segments, Counter())
-    say("Segments in all: " + ", ".join(f"{total[kind]} {kind}" for kind in KINDS) + ".")
-    for finding in conversion.get("findings", ()):
+    force = [float(curve.force_mN.max()) for curve in campaign.curves]
+    displacement = [float(curve.displacement_um.max()) for curve in campaign.curves]
+    say(f"Max force {span(force, 'mN')}, max displacement {span(displacement, 'um')}.")
+    say("Segments: " + ", ".join(f"{segments[kind]} {kind}" for kind in KINDS) + ".")
+    for finding in campaign.metadata.other.get("conversion", {}).get("findings", ()):
         say(f"Note: {finding['sentence']}." + (f" {finding['remedy']}." if finding["remedy"] else ""))
     for one in (*check_plausibility(campaign), *campaign_findings(check_tests(campaign))):
         say(f"{'Warning' if one.level != 'info' else 'Note'}: {one}", fg="red" if one.level == "error" else "yellow")

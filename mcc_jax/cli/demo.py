@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +14,9 @@ import click
 
 from .._store import Stage, results
 from . import options as common
-from .calibrate import say_state, say_warnings, write_calibration
+from .calibrate import say_calibration, write_calibration
 from .discover import DISCOVERY, write_discovery
-from .report import REPORT
+from .outputs import REPORT
 from .session import provenance, say, say_files, say_table, session
 
 if TYPE_CHECKING:
@@ -59,43 +58,36 @@ def demo(out: Path, seed: int) -> None:
       mcc-jax demo --out try --seed 1
     """
     with session(68) as progress, results(out) as stage:
-        secret = sealed_answer(seed)
+        effect, sealed = sealed_answer(seed)
         say("Something that the law does not contain is hidden in simulated tests. The answer is sealed, SHA-256:")
-        say(f"  {secret.sha256}", bold=True)
-        hidden, none = ({"seed": seed, "hidden": what} for what in ("sealed", "nothing"))
-        calibration, found = _job(stage, secret.effect, hidden, progress)
-        (stage.folder / SEALED).write_text(secret.text, encoding="utf-8")
+        say(f"  {seal_of(sealed)}", bold=True)
+        calibration, found = _job(stage, effect, {"seed": seed, "hidden": "sealed"}, progress)
+        (stage.folder / SEALED).write_text(sealed, encoding="utf-8")
         inner = Stage(stage.directory / NOTHING, stage.folder / NOTHING)
         inner.folder.mkdir()
-        absent = dataclasses.replace(secret.effect, amplitude=0.0)  # the law alone, by the program compiled above
-        _, nothing = _job(inner, absent, none, lambda step: progress(f"nothing hidden: {step}"))
+        absent = dataclasses.replace(effect, amplitude=0.0)  # the law alone, by the program compiled above
+        settings = {"seed": seed, "hidden": "nothing"}
+        _, nothing = _job(inner, absent, settings, lambda step: progress(f"nothing hidden: {step}"))
         stage.stale += [f"{NOTHING}/{name}" for name in inner.stale]
-    answer = json.loads(secret.text)
-    say()
     say(
-        f"The tests are SIMULATED from the paper's tables, not measured: {PARTICLES} particles, each with C1, C3 and C5"
+        f"\nThe tests are SIMULATED from the paper's tables, not measured: {PARTICLES} particles, each with its own "
+        "C1, C3\nand C5 drawn from Table 2, two cycles with holds, noise of 0.02 um and 0.05 mN.\n"
     )
-    say("of its own drawn from Table 2, two cycles with holds, noise of 0.02 um and 0.05 mN.")
-    say()
     _say_found(calibration, found)
-    say()
-    say("The seal is broken. Hidden was:", bold=True)
-    say(f"  {secret.text.strip()}")
-    agrees, sentence = compared(answer, found)
+    agrees, sentence = compared(json.loads(sealed), found)
+    say("\nThe seal is broken. Hidden was:", bold=True)
+    say(f"  {sealed.strip()}")
     say(sentence, fg="green" if agrees else "red", bold=True)
-    say(f"  (The seal is the SHA-256 of {SEALED}: sha256sum {shlex.quote(str(out / SEALED))})")
-    say()
+    say(f"  (The seal is the SHA-256 of {SEALED}: sha256sum {shlex.quote(str(out / SEALED))})\n")
     from ..discovery.sentences import headline
 
     right = nothing["verdict"] == "NO_GAP"
     say(f"The same with nothing hidden: {headline(nothing)}", nl=False)
-    say("" if right else " That is a FALSE ALARM.", fg="red", bold=True)
-    say()
+    say("\n" if right else " That is a FALSE ALARM.\n", fg="red", bold=True)
     figures = [*calibration["figures"], *found["figures"]]
     files = [*(f"campaign/{n}" for n in CAMPAIGN_FILES), *calibration["files"], "calibration.json", DISCOVERY, SEALED]
     say_files(out, [*figures, *files, REPORT])
-    say(f"  {NOTHING}/ (the same, with nothing hidden)")
-    say()
+    say(f"  {NOTHING}/ (the same, with nothing hidden)\n")
     say(f"What next? Open {out / REPORT} in a browser: it shows all of this, and what it means. Then, for example:")
     folder = shlex.quote(str(out / "campaign"))
     for comment, command in (
@@ -121,13 +113,11 @@ def _job(
     campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
     write_campaign(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, folder="campaign")
-    content = write_calibration(
-        sample(campaign, seed=seed, progress=progress), stage, origin=origin, figures=True, progress=progress
-    )
+    written: dict[str, Any] = {"origin": origin, "figures": True, "progress": progress}
+    content = write_calibration(sample(campaign, seed=seed, progress=progress), stage, **written)
     found = discover(campaign, experiments=False, seed=seed, progress=progress)
-    missing = write_discovery(found, stage, origin=origin, figures=True, progress=progress)
-    name = stage.directory.resolve().name
-    page = report_page(read_results(stage.folder, name=name), seed=seed, progress=progress)
+    missing = write_discovery(found, stage, **written)
+    page = report_page(read_results(stage.folder, name=stage.directory.resolve().name), progress=progress)
     (stage.folder / REPORT).write_text(page, encoding="utf-8")
     return content, missing
 
@@ -150,8 +140,7 @@ def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
     from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
     from ..discovery.sentences import headline
 
-    say_state(calibration)
-    say_warnings(calibration)
+    say_calibration(calibration, numbers=False)
     for place in found["where"][:3]:
         low, high = (100 * share for share in place["load_fraction"])
         at = "" if place["segment"] == "hold" else f" between {low:.0f} and {high:.0f} % of the largest load"
@@ -160,46 +149,23 @@ def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
     gap = found["gap"]
     if gap["closed_fraction"] is not None:
         before, after = (gap["steps"][i]["chi2_per_dof"] for i in (0, -1))
-        say(
-            f"Each particle predicted from the others: chi2 per point {before:.3g} by the law alone, {after:.3g} with "
-            "what was added; 1 is noise."
-        )
+        predicted = f"chi2 per point {before:.3g} by the law alone, {after:.3g} with what was added; 1 is noise"
+        say(f"Each particle predicted from the others: {predicted}.")
     say()
     sides = {"law alone": found["parameters_before"], "with what was added": found["parameters_after"]}
-    rows: dict[str, list[str]] = {}
-    for side in filter(None, sides.values()):
-        for one in quantities(side):
-            rows.setdefault(one.label, []).append(one.text)
+    texts = {name: {one.label: one.text for one in quantities(side)} for name, side in sides.items() if side}
     truth = {
         "shape parameter a": f"{PAPER_SHAPE_PARAMETER:g}",
         "effective modulus": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g} GPa",
         **{f"{name}, median": f"{math.exp(mean):.4g}" for name, (mean, _) in PAPER_LOG_C.items()},
     }
-    header = ("quantity", *(name for name, side in sides.items() if side), "the truth")
-    say_table(header, [(label, *rows[label], value) for label, value in truth.items()])
+    rows = [(label, *(side[label] for side in texts.values()), value) for label, value in truth.items()]
+    say_table(("quantity", *texts, "the truth"), rows)
     say("After ±: the standard deviation.")
 
 
-@dataclass(frozen=True)
-class Sealed:
-    """An answer that nobody can change unnoticed.
-
-    Attributes:
-        effect: what is hidden.
-        text: the answer with a number used once, without which the few possible answers could be tried.
-    """
-
-    effect: HiddenEffect
-    text: str
-
-    @property
-    def sha256(self) -> str:
-        """The seal: `sha256sum sealed.json` gives it, too."""
-        return hashlib.sha256(self.text.encode()).hexdigest()
-
-
-def sealed_answer(seed: int) -> Sealed:
-    """Draw what is hidden, how strong it is, and the number used once."""
+def sealed_answer(seed: int) -> tuple[HiddenEffect, str]:
+    """Draw what is hidden, and the answer as text, with a number used once, without which it could be guessed."""
     import numpy as np
 
     from ..effects import find_variant
@@ -209,15 +175,19 @@ def sealed_answer(seed: int) -> Sealed:
     name = list(STRENGTHS)[int(rng.integers(len(STRENGTHS)))]
     low, high = STRENGTHS[name]
     amplitude = float(f"{low * (high / low) ** rng.random():.3g}")
-    effect = HiddenEffect(find_variant(name), amplitude)
-    variant = effect.variant
+    variant = find_variant(name)
     answer = {
         "mechanism": name,
         "variant": variant.name,
         "parameters": {variant.parameter: amplitude} | {n.name: n.middle for n in variant.nuisances},
         "nonce": rng.bytes(16).hex(),
     }
-    return Sealed(effect, json.dumps(answer) + "\n")
+    return HiddenEffect(variant, amplitude), json.dumps(answer) + "\n"
+
+
+def seal_of(text: str) -> str:
+    """What `sha256sum sealed.json` gives, too."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .._errors import InputError
-from .._store import Stage, results
+from .._store import Stage, json_text, results
 from . import options as common
 from .session import (
+    drop_earlier,
     joint_model,
     provenance,
     read_without,
@@ -24,7 +25,6 @@ from .session import (
     sentence,
     session,
     write_figures,
-    write_result,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ ROWS = 6
 
 
 @click.command(short_help="Find, name and add what the law misses.")
-@common.campaign()
+@common.campaign
 @common.out(required=True)
 @common.exclude
 @common.leave_out
@@ -89,32 +89,26 @@ def discover(
         data = read_without(campaign, options["leave_out"], progress)
         parts = {"experiments": not no_experiments, "posterior": not no_posterior}
         origin = provenance("discover", campaign, options | {"held_out": not no_held_out} | parts)
+        chosen = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")} | parts
         with results(out) as stage:
-            model = joint_model(options)
-            chosen = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")}
-            found = find(data, model=model, confirm=not no_held_out, progress=progress, **parts, **chosen)
+            found = find(data, model=joint_model(options), confirm=not no_held_out, progress=progress, **chosen)
             content = write_discovery(found, stage, origin=origin, figures=not no_figures, progress=progress)
     if as_json:
         say_json(content)
         return
     from ..calibrate.results import DISCOVERY_ARCHIVE
-    from ..report.sentences import calibration_with_found
+    from ..report.texts import calibration_with_found
 
     say_discovery(content)
-    say()
     say_files(out, [*content["figures"], DISCOVERY_ARCHIVE, DISCOVERY])
-    with_found = calibration_with_found(content, shlex.quote(str(campaign)))
     say_next(
-        (with_found, "the law with what was found"),
+        (calibration_with_found(content, shlex.quote(str(campaign))), "the law with what was found"),
         (f"mcc-jax report {shlex.quote(str(out))}", "all of it on one page"),
     )
 
 
 def require_mechanisms(names: tuple[str, ...]) -> None:
-    """Refuse to exclude what does not exist, before anything is computed.
-
-    Raises `InputError` naming the mechanisms there are.
-    """
+    """Refuse to exclude what does not exist, before anything is computed."""
     from ..effects import LIBRARY
 
     for name in names:
@@ -134,7 +128,8 @@ def write_discovery(
 
         return discovery_figures(found)
 
-    names = write_figures(stage, DISCOVERY, draw if figures else None, progress)
+    names = write_figures(stage, draw if figures else None, progress)
+    drop_earlier(stage, DISCOVERY, names)
     return found.write(stage.folder, figures=names, provenance=dict(origin))
 
 
@@ -149,29 +144,31 @@ def say_discovery(content: dict[str, Any]) -> None:
         say(line)
     for text in content["notes"]:
         say(f"Note: {sentence(text)}", fg="yellow")
-    if not content["ranking"]:
-        return
+    rows = [
+        (
+            entry["mechanism"],
+            f"{entry['statistic']:.1f}",
+            _with_unit(entry["estimate"], ".3g", entry["unit"]),
+            _with_unit(entry["detection_limit"], ".2g", entry["unit"]),
+            f"{entry['probability']:.3f}",
+        )
+        for entry in content["ranking"][:ROWS]
+    ]
+    if rows:
+        say()
+        say_table(("mechanism", "statistic", "estimate", "detection limit", "probability"), rows)
+        further = len(content["ranking"]) - len(rows)
+        more = f"; {further} more in {DISCOVERY}" if further else ""
+        say(f"Each against the law alone{more}. Probability: of the mechanism, if one is missing.")
     say()
-    rows = []
-    forms = {"statistic": ".1f", "estimate": ".3g", "detection_limit": ".2g", "probability": ".3f"}
-    for entry in content["ranking"][:ROWS]:
-        units = {"estimate": entry["unit"], "detection_limit": entry["unit"]}
-        numbers = (_number(entry[name], form, units.get(name, "-")) for name, form in forms.items())
-        rows.append((entry["mechanism"], *numbers))
-    say_table(("mechanism", "statistic", "estimate", "detection limit", "probability"), rows)
-    further = len(content["ranking"]) - len(rows)
-    say(
-        f"Each against the law alone{f'; {further} more in {DISCOVERY}' if further > 0 else ''}. Probability: of the "
-        "mechanism, if one is missing."
-    )
 
 
-def _number(value: float | None, form: str, unit: str = "-") -> str:
+def _with_unit(value: float | None, form: str, unit: str) -> str:
     return ("unknown" if value is None else format(value, form)) + ("" if unit == "-" else f" {unit}")
 
 
 @click.command(short_help="Say what a planned campaign could show.")
-@common.campaign()
+@common.campaign
 @common.out(required=True)
 @common.exclude
 @common.threshold(default=0.0)
@@ -205,13 +202,14 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
                 progress=progress,
             )
             content = found.to_json()
-            write_result(stage, POWER, content)
+            (stage.folder / POWER).write_text(json_text(content), encoding="utf-8")
     if as_json:
         say_json(content)
         return
     rows = []
     for entry in content["mechanisms"]:
-        limits = (_number(value, ".2g", entry["unit"]) for value in (entry["detection_limit"], entry["plausible"][1]))
+        ends = entry["detection_limit"], entry["plausible"][1]
+        limits = (_with_unit(value, ".2g", entry["unit"]) for value in ends)
         rows.append((entry["mechanism"], *limits, "yes" if entry["visible"] else "no"))
     say_table(("mechanism", "found from", "largest plausible", "can be seen"), rows)
     for entry in content["untestable"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import contextlib
 import errno
 import io
 import os
@@ -11,7 +12,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import click
@@ -21,8 +22,7 @@ from .calibrate import calibrate
 from .convert import convert
 from .demo import demo
 from .discover import discover, power
-from .export import export
-from .report import report
+from .outputs import export, report
 from .session import BAD_INPUT, DEFECT, DONE, INTERRUPTED, PROGRAM
 from .simulate import simulate
 
@@ -52,12 +52,17 @@ Shell completion (bash; likewise zsh_source, fish_source):
 """
 
 
-class Stop(Exception):
+class Stop(click.ClickException):
     """The end of a run before its time: the exit status, and what to say on standard error, nothing if empty."""
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
-        self.status, self.line = status, line
+        self.exit_code = status
+
+    def show(self, file: Any = None) -> None:
+        """Print the line."""
+        if self.message:
+            click.echo(one_line(f"{PROGRAM}: {self.message}"), err=True)
 
 
 def one_line(text: str) -> str:
@@ -72,8 +77,10 @@ def explain(error: BaseException, debug: bool) -> Stop:
             return error
         case KeyboardInterrupt() | click.Abort():
             return Stop(INTERRUPTED, "interrupted")
-        case BrokenPipeError():
-            return Stop(DONE, "")  # whoever reads our output has seen enough
+        case BrokenPipeError():  # the reader of our output has seen enough; Python flushes it once more at its end
+            with contextlib.suppress(OSError, AttributeError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return Stop(DONE, "")
         case InputError():
             problem = str(error)
         case click.MissingParameter(param=click.Option(name="out"), ctx=click.Context(command_path=command)):
@@ -105,50 +112,28 @@ def _defect(error: BaseException, debug: bool) -> Stop:
     return Stop(DEFECT, f"internal error: {name}: {text}. This is a defect of {PROGRAM}; please report it{hint}.")
 
 
+@contextlib.contextmanager
+def _explained(debug: bool = False) -> Iterator[None]:
+    try:
+        yield
+    except click.exceptions.Exit:
+        raise
+    except (Exception, KeyboardInterrupt) as error:
+        raise explain(error, debug) from error
+
+
 class OneLineGroup(click.Group):
     """A group of commands whose every failure is one line on standard error."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the options of the group itself."""
+        with _explained():
+            return super().parse_args(ctx, args)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; whatever it raises becomes `Stop`."""
-        try:
+        with _explained(bool(ctx.params.get("debug"))):
             return super().invoke(ctx)
-        except (click.ClickException, click.exceptions.Exit):
-            raise
-        except (Exception, KeyboardInterrupt) as error:
-            raise explain(error, bool(ctx.params.get("debug"))) from error
-
-    def main(self, args: Sequence[str] | None = None, *more: Any, standalone_mode: bool = True, **extra: Any) -> Any:
-        """Run and leave with an exit status; see `click.Command.main`."""
-        try:
-            status = super().main(args, *more, standalone_mode=False, **extra)
-        except (Exception, KeyboardInterrupt) as error:
-            if not standalone_mode:
-                raise
-            stop = explain(error, bool(os.environ.get("MCC_JAX_DEBUG")))
-            if stop.line:
-                click.echo(one_line(f"{PROGRAM}: {stop.line}"), err=True)
-            if isinstance(error.__cause__, BrokenPipeError):
-                _silence_stdout()
-            sys.exit(stop.status)
-        if not standalone_mode:
-            return status
-        sys.exit(status if isinstance(status, int) else DONE)
-
-
-def _silence_stdout() -> None:
-    """Keep the interpreter from complaining about the broken pipe when it flushes at its end."""
-    try:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, AttributeError, ValueError):
-        return
-
-
-def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted and not ctx.resilient_parsing:
-        from .._extras import own_version
-
-        click.echo(f"{PROGRAM} {own_version()}")
-        ctx.exit()
 
 
 @click.group(
@@ -159,7 +144,7 @@ def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.option("--debug", is_flag=True, envvar="MCC_JAX_DEBUG", help="Show the traceback of an internal error.")
-@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Show the version.")
+@click.version_option(package_name="mcc_jax", message="%(prog)s %(version)s", help="Show the version.")
 @click.pass_context
 def cli(ctx: click.Context, debug: bool) -> None:
     """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover, report."""
@@ -171,12 +156,9 @@ for _command in (demo, simulate, convert, calibrate, discover, power, report, ex
     cli.add_command(_command)
 
 
-class _Terminated(SystemExit):
-    """The process was asked to end; before it does, everything it had begun is cleared up."""
-
-
 def _terminate(number: int, _: Any) -> None:
-    raise _Terminated(128 + number)
+    """End the process, which clears up what it had begun."""
+    raise SystemExit(128 + number)
 
 
 def _send(number: int, after_s: float) -> None:
@@ -197,7 +179,7 @@ def _unraisable(found: Any) -> None:
     match found.exc_value:
         case KeyboardInterrupt():
             _send(signal.SIGINT, after_s=0.05)
-        case _Terminated(code=int(status)):
+        case SystemExit(code=int(status)) if status > 128:
             _send(status - 128, after_s=0.05)
         case _:
             sys.__unraisablehook__(found)
@@ -218,10 +200,10 @@ def main() -> None:
     try:
         cli.main(prog_name=PROGRAM)
     except SystemExit as end:
-        if not isinstance(end, _Terminated) and end.code != INTERRUPTED:
+        if not (isinstance(end.code, int) and end.code > 128):  # not ended by a signal
             raise
         # All is cleared up by now. What is left, the libraries' own tear-down, once took over a minute: it waits for
         # compilers that are at work in other threads.
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(int(str(end.code)))
+        os._exit(end.code)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +12,20 @@ UNLOADING = ("printed", "punch", "punch_exact")
 STRAIN_SCALING = ("raw", "contact", "master")
 
 
-def number(least: float | int | None = None, *, above: bool = False) -> Callable[[Any], float]:
-    """A type of option: a finite number, from `least` on; `above` refuses the smallest number itself."""
+class Number(click.FloatRange):
+    """A finite number of sensible size, which excludes `nan` as well."""
 
-    def convert(value: Any) -> float:
-        try:
-            found = float(value)
-        except ValueError:
-            raise click.BadParameter(f"{value!r} is not a number.") from None
-        if not math.isfinite(found) or abs(found) > LARGEST:
-            raise click.BadParameter(f"{value!r} is not a finite number of sensible size.")
-        if least is not None and (found <= least if above else found < least):
-            raise click.BadParameter(f"{value} is not {'above' if above else 'at least'} {least:g}.")
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number of a text."""
+        found = super().convert(value, param, ctx)
+        if not abs(found) <= LARGEST:
+            self.fail(f"{value!r} is not a finite number of sensible size.", param, ctx)
         return found
 
-    return convert
 
-
-_positive = number(0, above=True)
+NUMBER, POSITIVE, NOT_NEGATIVE = Number(), Number(min=0, min_open=True), Number(min=0)
 
 
 def whole_number(value: Any) -> int:
@@ -41,20 +35,15 @@ def whole_number(value: Any) -> int:
 
 def levels(value: Any) -> tuple[float, ...]:
     """Positive numbers with commas between them."""
-    return value if isinstance(value, tuple) else tuple(_positive(part) for part in str(value).split(","))
+    return tuple(POSITIVE.convert(part, None, None) for part in value.split(","))
 
 
 def interval(value: Any) -> tuple[float, float]:
     """A positive number, or two with a colon between them."""
-    if isinstance(value, tuple):
-        return value
-    parts = str(value).split(":")
-    if len(parts) > 2:
+    ends = [POSITIVE.convert(part, None, None) for part in value.split(":")]
+    if len(ends) > 2 or ends[0] > ends[-1]:
         raise click.BadParameter(f"{value!r} is neither a number nor LOW:HIGH.")
-    low, high = _positive(parts[0]), _positive(parts[-1])
-    if low > high:
-        raise click.BadParameter(f"{value!r} begins with the larger number; write LOW:HIGH.")
-    return low, high
+    return ends[0], ends[-1]
 
 
 class Location(click.Path):
@@ -83,9 +72,7 @@ class CampaignFolder(Location):
         return path
 
 
-def campaign() -> Any:
-    """The argument CAMPAIGN."""
-    return click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
+campaign = click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 
 
 def out(**settings: Any) -> Any:
@@ -98,21 +85,36 @@ def seed(help: str = "Seed of all draws.") -> Any:
     return click.option("--seed", type=whole_number, default=0, show_default=True, metavar="N", help=help)
 
 
+no_seed = click.option("--seed", type=whole_number, hidden=True, expose_value=False)
+"""Accepted, since every command takes a seed, and not shown where nothing is random."""
+
+
+def diameters(help: str) -> Any:
+    """`--diameters`: three lengths or a table."""
+
+    def given(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
+        if value is not None and not value.strip():
+            raise click.BadParameter("it is empty.", ctx, param)
+        return value
+
+    return click.option("--diameters", metavar="D1,D2,D3|FILE", callback=given, help=help)
+
+
 def threshold(use: str = ": points below it do not count.", default: float = 0.2) -> Any:
     """`--threshold-MPa`; `use` says what it does."""
     text = f"Stress below which only surface asperities deform{use}"
-    settings = {"type": number(0), "metavar": "MPa", "default": default, "show_default": True}
+    settings = {"type": NOT_NEGATIVE, "metavar": "MPa", "default": default, "show_default": True}
     return click.option("--threshold-MPa", "threshold_MPa", help=text, **settings)
 
 
-def priors(where: str = "") -> Any:
-    """`--priors FILE`; `where` says with which methods."""
-    return click.option("--priors", type=Location(), metavar="FILE", help=f"TOML file of priors.{where}")
+def priors(**settings: Any) -> Any:
+    """`--priors FILE`."""
+    return click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.", **settings)
 
 
-def one_of(name: str, choices: tuple[str, ...], help: str) -> Any:
+def one_of(name: str, choices: tuple[str, ...], help: str, **settings: Any) -> Any:
     """An option that takes one of several words, the first if it is not given."""
-    return click.option(name, type=click.Choice(choices), default=choices[0], show_default=True, help=help)
+    return click.option(name, type=click.Choice(choices), default=choices[0], show_default=True, help=help, **settings)
 
 
 def law(command: Any) -> Any:

@@ -11,7 +11,7 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 PROGRAM = "mcc-jax"
 DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 FIGURES = "figures"
+OWN_FILES = re.compile(rf"{FIGURES}/[A-Za-z0-9_-]+\.png|posterior\.nc|calibration\.msgpack")
 PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy", "scipy")
 
 
@@ -46,33 +47,25 @@ def session(steps: int) -> Iterator[Progress]:
 
         jax.config.update("jax_enable_x64", True)
         _keep_compiled(jax.config)
-        require_device()
+        try:
+            jax.devices()
+        except (RuntimeError, AssertionError) as error:  # of a platform that is not installed it says either
+            asked = os.environ.get("JAX_PLATFORMS") or jax.config.read("jax_platforms") or "the default"
+            why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0][:160]  # its hint is in the remedy
+            problem = f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else "")
+            remedy = "Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator"
+            raise InputError(problem, remedy=remedy) from None
         yield progress
-
-
-def require_device() -> None:
-    """Start JAX on the device that it is set to use. Raises `InputError` if there is none of that kind."""
-    import jax
-
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError) as error:  # of a platform that is not installed it says either
-        asked = os.environ.get("JAX_PLATFORMS") or jax.config.read("jax_platforms") or "the default"
-        why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0][:160]  # its hint is in the remedy
-        problem = f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else "")
-        remedy = "Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator"
-        raise InputError(problem, remedy=remedy) from None
 
 
 CACHE_BYTES = 300 * 2**20  # most disk used for compiled functions; the oldest are removed
 
 
 def _keep_compiled(config: Any) -> None:
-    """Let the next process find what this one compiles, in the user's folder for caches.
+    """Let the next process find what this one compiles, in the user's folder for caches, one for each machine.
 
-    JAX_COMPILATION_CACHE_DIR and JAX_ENABLE_COMPILATION_CACHE=0 have precedence. Compiled code belongs to one machine:
-    where several share a home, each has a folder. It is code that will be run, so a folder that others could write to
-    is not used.
+    JAX_COMPILATION_CACHE_DIR and JAX_ENABLE_COMPILATION_CACHE=0 have precedence. What is there will be run, so a folder
+    that others could write to is not used.
     """
     if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
         return
@@ -90,15 +83,14 @@ def _keep_compiled(config: Any) -> None:
 
 
 def _private(folder: Path) -> bool:
-    """Whether a folder is no link, ours, and nobody else may write to it; made where it is missing."""
+    """Whether a folder, made where it is missing, is no link, ours, and nobody else may write to it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()
     except OSError:
         return False
-    if not stat.S_ISDIR(found.st_mode) or not os.access(folder, os.W_OK):
-        return False
-    return os.name != "posix" or (found.st_uid == os.geteuid() and not found.st_mode & 0o022)
+    ours = os.name != "posix" or (found.st_uid == os.geteuid() and not found.st_mode & 0o022)
+    return ours and stat.S_ISDIR(found.st_mode) and os.access(folder, os.W_OK)
 
 
 @contextlib.contextmanager
@@ -209,57 +201,43 @@ def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, sha
 def provenance(
     command: str, campaign: Path, settings: Mapping[str, Any], *, folder: str | None = None
 ) -> dict[str, Any]:
-    """Folder and checksums of the campaign, settings of the command in force, versions of what computed.
-
-    The result names the folder by its absolute path, or as `folder`.
-    """
+    """Folder (absolute, or as `folder`) and checksums of the campaign, settings in force, versions of packages."""
     import platform
     from importlib.metadata import version
 
     from .._extras import own_version
     from ..campaign import file_checksums
 
-    def plain(value: Any) -> Any:
-        return value.name if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
-
+    settings = {
+        name: value.name if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
+        for name, value in settings.items()
+    }
     versions = {"mcc_jax": own_version(), "python": platform.python_version(), **{n: version(n) for n in PACKAGES}}
     return {
         "campaign": {"folder": folder or str(campaign.resolve()), "sha256": file_checksums(campaign)},
-        "settings": {"command": command} | {name: plain(value) for name, value in settings.items()},
+        "settings": {"command": command, **settings},
         "versions": versions,
     }
 
 
-def listed(result: Path, key: str, pattern: str) -> list[str]:
-    """Files that an earlier result names as its own; what is no such result names none."""
-    names: Any = None
-    with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
-        names = json.loads(read_regular(result, RESULT_BYTES, ""))[key]
-    return [n for n in names if isinstance(n, str) and re.fullmatch(pattern, n)] if isinstance(names, list) else []
+def drop_earlier(stage: Stage, result: str, names: Sequence[str]) -> None:
+    """Files that an earlier `result` lists as its own become stale, but for those that this run writes."""
+    with contextlib.suppress(ValueError, AttributeError, TypeError, RecursionError):  # there is none, or it is damaged
+        earlier = json.loads(read_regular(stage.directory / result, RESULT_BYTES, ""))
+        listed = [name for key in ("figures", "files") for name in earlier.get(key, ())]
+        own = [name for name in listed if isinstance(name, str) and OWN_FILES.fullmatch(name)]
+        stage.stale += [name for name in own if name not in names]
 
 
-def write_figures(
-    stage: Stage, result: str, draw: Callable[[], Mapping[str, Any]] | None, progress: Progress
-) -> list[str]:
-    """Draw into the stage, and give the figures' names; `draw` is None for no figures.
-
-    Figures that an earlier file `result` lists as its own, and this run does not draw, become stale.
-    """
-    names: list[str] = []
+def write_figures(stage: Stage, draw: Callable[[], Mapping[str, Any]] | None, progress: Progress) -> list[str]:
+    """Draw into the stage, unless `draw` is None; the figures' names."""
     progress("writing" if draw is None else "drawing the figures")
-    if draw is not None:
-        from ..plots import save_figures
+    if draw is None:
+        return []
+    from ..plots import save_figures
 
-        (stage.folder / FIGURES).mkdir(exist_ok=True)
-        names = sorted(f"{FIGURES}/{path.name}" for path in save_figures(draw(), stage.folder / FIGURES))
-    earlier = listed(stage.directory / result, "figures", rf"{FIGURES}/[A-Za-z0-9_-]+\.png")
-    stage.stale += [name for name in earlier if name not in names]
-    return names
-
-
-def write_result(stage: Stage, result: str, content: dict[str, Any]) -> None:
-    """Write a result file into the stage."""
-    (stage.folder / result).write_text(json_text(content), encoding="utf-8")
+    (stage.folder / FIGURES).mkdir(exist_ok=True)
+    return sorted(f"{FIGURES}/{path.name}" for path in save_figures(draw(), stage.folder / FIGURES))
 
 
 def say_json(content: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,17 +22,18 @@ if TYPE_CHECKING:
     from ..law import MccLaw
     from ..simulate import HiddenEffect, Programme
 
+COEFFICIENTS = ("C1", "C3", "C5")
 MAX_ROWS = 10_000_000
 LONGEST_S = 1e12
-POSITIVE, NOT_NEGATIVE = common.number(0, above=True), common.number(0)
 
 
 def _option(name: str, unit: str, kind: Callable[[Any], Any] | click.ParamType, text: str, **settings: Any) -> Any:
-    return click.option(name, name[2:].replace("-", "_"), type=kind, metavar=unit, help=text, **settings)
+    variable = name[2:].replace("-", "_")  # click itself would write it in lower case
+    return click.option(name, variable, type=kind, metavar=unit, help=text, **settings)
 
 
 def _zero(name: str, unit: str, text: str) -> Any:
-    return _option(name, unit, NOT_NEGATIVE, text, default=0.0, show_default=True)
+    return _option(name, unit, common.NOT_NEGATIVE, text, default=0.0, show_default=True)
 
 
 @click.command(short_help="Test particles in the computer.")
@@ -46,12 +46,12 @@ def _zero(name: str, unit: str, text: str) -> Any:
 )
 @_option("--programme", "FILE", common.Location(), "TOML file with the steps of the test; see above.")
 @click.option("--control", type=click.Choice(["load", "displacement"]), help="Controlled quantity.  [default: load]")
-@_option("--rate", "mN/s|um/s", POSITIVE, "Rate in mN/s or, under displacement control, um/s.  [default: 2]")
+@_option("--rate", "mN/s|um/s", common.POSITIVE, "Rate in mN/s or, under displacement control, um/s.  [default: 2]")
 @_option("--levels", "L1,L2,...", common.levels, "Peak of each cycle as a share of the particle's peak.  [default: 1]")
-@_option("--unload-to", "SHARE", NOT_NEGATIVE, "Share at which reloading starts.  [default: 0]")
-@_option("--hold-s", "s", POSITIVE, "Hold at every level.  [default: none]")
+@_option("--unload-to", "SHARE", common.NOT_NEGATIVE, "Share at which reloading starts.  [default: 0]")
+@_option("--hold-s", "s", common.POSITIVE, "Hold at every level.  [default: none]")
 @_option("--points", "N", click.IntRange(2, 1_000_000), "Samples of a test.  [default: 300]")
-@_option("--interval-s", "s", POSITIVE, "Time between samples, instead of --points.")
+@_option("--interval-s", "s", common.POSITIVE, "Time between samples, instead of --points.")
 @_option(
     "--peak-stress",
     "MPa|LOW:HIGH",
@@ -67,11 +67,11 @@ def _zero(name: str, unit: str, text: str) -> Any:
 @click.option(
     "--shared-material", is_flag=True, help="Give all particles the mean law of Table 2 instead of draws from it."
 )
-@_option("--C1", "C1", POSITIVE, "Fix C1 for all particles.  [default: drawn from Table 2]")
-@_option("--C3", "C3", NOT_NEGATIVE, "Fix C3 likewise.")
-@_option("--C5", "C5", POSITIVE, "Fix C5 likewise.")
-@_option("--a", "A", common.number(), "Shape parameter.", default=1.43, show_default=True)
-@_option("--effective-modulus", "MPa", POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
+@_option("--C1", "C1", common.POSITIVE, "Fix C1 for all particles.  [default: drawn from Table 2]")
+@_option("--C3", "C3", common.NOT_NEGATIVE, "Fix C3 likewise.")
+@_option("--C5", "C5", common.POSITIVE, "Fix C5 likewise.")
+@_option("--a", "A", common.NUMBER, "Shape parameter.", default=1.43, show_default=True)
+@_option("--effective-modulus", "MPa", common.POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
 @common.law
 @click.option(
     "--effect",
@@ -116,34 +116,31 @@ def simulate(out: Path, **options: Any) -> None:
         from ..campaign import write_campaign
 
         progress("reading the input")
-        sizes = _sizes(options["particles"])
-        hidden = _hidden_effects(options["effects"], sizes)
+        sizes, hidden = _sizes(options["particles"]), _hidden_effects(options["effects"])
         progress("simulating")
-        laws = _laws(options, sizes)
-        programme = _programme(options)
+        laws, programme = _laws(options, sizes), _programme(options)
         peaks = _peaks(options, programme, laws, sizes)
         _check_size(programme, peaks, options["programme"])
         with results(out) as stage:
             campaign = _campaign(laws, sizes, peaks, programme, options, hidden)
             progress("writing")
             write_campaign(campaign, stage.folder)
-    points = [len(curve) for curve in campaign.curves]
+    points = sum(len(curve) for curve in campaign.curves)
     forces = [curve.force_mN.max() for curve in campaign.curves]
-    what = f"{sum(points)} points, {programme.control} control, seed {options['seed']}"
-    say(f"Simulated {len(campaign)} particles, {what}.")
     longest = max(float(curve.time_s[-1]) for curve in campaign.curves)
+    seed, control = options["seed"], programme.control
+    say(f"Simulated {len(campaign)} particles, {points} points, {control} control, seed {seed}.")
     say(f"Peak forces {min(forces):.4g} to {max(forces):.4g} mN; the tests take up to {longest:.4g} s.")
     for effect in hidden:
         variant = effect.variant
         drawn = " (drawn for each test)" if variant.parameter in effect.random else ""
         amplitude = f"{variant.parameter} {effect.strength:.4g}{drawn}"
         say(f"Hidden effect: {variant.mechanism}, {variant.name}, {amplitude}.")
-    falling = [
-        name for name, flag in zip(campaign.particles, campaign.columns["true_monotone"], strict=True) if flag == "no"
-    ]
+    monotone = zip(campaign.particles, campaign.columns["true_monotone"], strict=True)
+    falling = ", ".join(name for name, flag in monotone if flag == "no")
     if falling:
-        what = "snaps through" if programme.control == "load" else "softens"
-        say(f"Warning: the loading curve falls somewhere, and the particle {what}: {', '.join(falling)}.", fg="yellow")
+        what = "snaps through" if control == "load" else "softens"
+        say(f"Warning: the loading curve falls somewhere, and the particle {what}: {falling}.", fg="yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say_next((f"mcc-jax calibrate {shlex.quote(str(out))} --out fit", "the law and its uncertainty"))
 
@@ -166,7 +163,7 @@ def _refuse_contradictions(options: dict[str, Any]) -> None:
         raise click.UsageError("--unload-to needs two --levels or more: the last unloading is always complete.")
     if unload_to is not None and unload_to >= min(levels[:-1]):
         raise click.UsageError("--unload-to lies not below the --levels it unloads from.")
-    if options["shared_material"] and all(options[name] is not None for name in ("C1", "C3", "C5")):
+    if options["shared_material"] and all(options[name] is not None for name in COEFFICIENTS):
         both = "--shared-material does not go with --C1, --C3 and --C5"
         raise click.UsageError(f"{both}: they fix the material already.")
 
@@ -191,6 +188,19 @@ def _sizes(file: Path | None) -> Sizes:
     return Sizes(names, diameters, {k: v for k, v in columns.items() if not k.startswith("true_")}, file)
 
 
+def _hidden_effects(texts: Sequence[str]) -> list[HiddenEffect]:
+    """The effects of the option --effect. Raises `InputError` naming the valid choices."""
+    from ..simulate import read_effect
+
+    hidden = []
+    for text in texts:
+        try:
+            hidden.append(read_effect(text))
+        except ValueError as error:
+            raise InputError(f"--effect {text}: {error}") from error
+    return hidden
+
+
 def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
     """One law per particle, of fixed or drawn coefficients."""
     import equinox as eqx
@@ -204,7 +214,7 @@ def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
 
     count, a = len(sizes.names), options["a"]
     plastic = draw_plastic(count, options["seed"], shared=options["shared_material"])
-    for name in ("C1", "C3", "C5"):
+    for name in COEFFICIENTS:
         if options[name] is not None:
             plastic = eqx.tree_at(lambda p, n=name: getattr(p, n), plastic, jnp.full(count, options[name]))
     eta = of_each_particle(sizes.diameters_um, lambda p: plastic_shape_factor(p, a))
@@ -223,15 +233,8 @@ def _programme(options: Mapping[str, Any]) -> Programme:
 
     if options["programme"] is not None:
         return read_programme(options["programme"])
-    return Programme.cycles(
-        control=options["control"] or "load",
-        rate=2.0 if options["rate"] is None else options["rate"],
-        levels=options["levels"] or (1.0,),
-        unload_to=options["unload_to"] or 0.0,
-        hold_s=options["hold_s"] or 0.0,
-        interval_s=options["interval_s"],
-        points=options["points"],
-    )
+    names = ("control", "rate", "levels", "unload_to", "hold_s", "interval_s", "points")
+    return Programme.cycles(**{name: options[name] for name in names if options[name] is not None})
 
 
 def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes: Sizes) -> np.ndarray:
@@ -258,45 +261,25 @@ def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes
 
 def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> None:
     """Refuse what would fill memory or disk."""
+    import numpy as np
+
     from ..simulate import Ramp
 
-    rows = 0.0
-    for peak in peaks:
-        duration, level = 0.0, 0.0
-        for step in programme.steps:
-            if isinstance(step, Ramp):
-                duration += abs(step.to - level) * float(peak) / step.rate
-                level = step.to
-            else:
-                duration += step.seconds
-        if not duration < LONGEST_S:
-            raise InputError(f"a test would take {duration:.4g} s", file=file, remedy="Give a higher rate")
-        samples = programme.points or math.ceil(duration / (programme.interval_s or 1.0))
-        rows += samples + len(programme.steps)
-        if rows > MAX_ROWS or samples * len(programme.steps) > 10 * MAX_ROWS:
-            problem = f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points"
-            raise InputError(problem, file=file, remedy="Take fewer points, a longer interval or a higher rate")
-
-
-def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ...]:
-    """The effects of the option --effect.
-
-    Raises `InputError` naming the valid choices, or what an effect needs of the table of particles.
-    """
-    from ..effects import HUMIDITY_COLUMN, Need
-    from ..simulate import read_effect
-
-    hidden = []
-    for text in texts:
-        try:
-            hidden.append(read_effect(text))
-        except ValueError as error:
-            raise InputError(f"--effect {text}: {error}") from error
-    wet = [effect for effect in hidden if Need.HUMIDITY_COLUMN in effect.variant.needs]
-    if wet and HUMIDITY_COLUMN not in sizes.columns:
-        problem = f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles"
-        raise InputError(problem, file=sizes.file, remedy="Give --particles FILE with that column")
-    return tuple(hidden)
+    moving = holding = level = 0.0  # moving: the time of the ramps for a peak of 1
+    for step in programme.steps:
+        if isinstance(step, Ramp):
+            moving += abs(step.to - level) / step.rate
+            level = step.to
+        else:
+            holding += step.seconds
+    durations = moving * peaks + holding
+    if not durations.max() < LONGEST_S:
+        raise InputError(f"a test would take {durations.max():.4g} s", file=file, remedy="Give a higher rate")
+    samples = np.ceil(durations / programme.interval_s) if programme.interval_s else programme.points
+    rows, steps = np.broadcast_to(samples, peaks.shape), len(programme.steps)
+    if np.sum(rows + steps) > MAX_ROWS or rows.max() * steps > 10 * MAX_ROWS:
+        problem = f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points"
+        raise InputError(problem, file=file, remedy="Take fewer points, a longer interval or a higher rate")
 
 
 def _campaign(
@@ -322,7 +305,6 @@ def _campaign(
         force_resolution_mN=options["resolution_mN"],
         zero_um=options["zero_um"],
     )
-    humidity = humidity_column(sizes.names, sizes.columns, str(sizes.file or "")) if effects else None
     extreme = "Choose less extreme values"
     try:
         campaign = simulate_campaign(
@@ -333,14 +315,12 @@ def _campaign(
             instrument=instrument,
             particles=sizes.names,
             effects=effects,
-            relative_humidity_percent=humidity,
+            relative_humidity_percent=humidity_column(sizes.names, sizes.columns, "") if effects else None,
             seed=options["seed"],
             provenance=f"simulated by mcc-jax simulate, seed {options['seed']}; not a measurement",
         )
-    except ValueError as error:
-        raise InputError(str(error), file=options["programme"] or sizes.file, remedy=extreme) from error
-    campaign = dataclasses.replace(campaign, columns={**sizes.columns, **campaign.columns})
-    try:
+        campaign = dataclasses.replace(campaign, columns={**sizes.columns, **campaign.columns})
         return check_campaign(campaign, file="")
-    except InputError as error:
-        raise InputError(f"what was simulated is no campaign: {error.problem}", remedy=extreme) from error
+    except ValueError as error:
+        problem = error.problem if isinstance(error, InputError) else str(error)
+        raise InputError(problem, file=options["programme"] or sizes.file, remedy=extreme) from error

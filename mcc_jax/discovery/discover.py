@@ -89,9 +89,7 @@ def discover(
     findings = campaign_findings(campaign)
     wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "error"]
     if wrong:
-        summary = (
-            f"These numbers cannot be true as they stand: {wrong[0]} Nothing is looked for before that is settled."
-        )
+        summary = f"These numbers are implausible: {wrong[0]} Nothing is looked for before that is settled."
         found = Discovery("FIT_NOT_CONVERGED", summary, None, None, seed, 0.0)
         return _finished(found, (*wrong, *findings), started)
     begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, progress=progress)
@@ -331,7 +329,7 @@ def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, 
         # The draws take the leading formula for true: their errors would be too small.
         note = (
             "parameters and their errors allow for what else may be missing and for how far the formula is off; the "
-            "posterior's draws take the formula as it stands"
+            "posterior's draws take the formula unchanged"
         )
         return replace(found, posterior=drawn, effects=effects, notes=(*found.notes, note))
     return replace(found, posterior=drawn, effects=effects, parameters_after=parameters)

@@ -138,9 +138,9 @@ def pair_integrals(
 def testable_columns(
     base: Base, state: State, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism]
 ) -> tuple[tuple[Candidate, ...], np.ndarray]:
-    """The formulas of a library that tests can tell, and their signatures.
+    """The formulas of a library that tests can distinguish, and their signatures.
 
-    Those of the whole library are worked out: campaigns that can tell different ones share what is compiled.
+    Those of the whole library are worked out: campaigns that distinguish different ones share what is compiled.
     """
     every = candidates_of(whole)
     rows = [k for k, c in enumerate(every) if c.mechanism in testable and c.variant in testable[c.mechanism].variants]
@@ -182,6 +182,6 @@ def screen(
 
 
 def first_order(base: Base, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism] | None = None) -> Screen:
-    """Scores of a library around the base law at its own hyperparameters, or of what of it the tests can tell."""
+    """Scores of a library around the base law at its own hyperparameters, or of those that tests can distinguish."""
     candidates, columns = testable_columns(base, base.state, whole, whole if testable is None else testable)
     return screen(base, base.state, base.hyperparameters, candidates, columns, several=False)

@@ -48,9 +48,9 @@ class Search:
 
         Args:
             base: the tests.
-            library: mechanisms that are searched for, with the formulas that the tests can tell.
+            library: mechanisms that are searched for, with the formulas that the tests can distinguish.
             progress: called with the name of each step.
-            whole: the library with the formulas that the tests cannot tell.
+            whole: the library with the formulas that the tests cannot distinguish.
         """
         self.library, self.progress = library, progress
         base, start = with_likely_noise(base)

@@ -77,7 +77,7 @@ def summary_of(found: Discovery) -> str:
         rivals = [plain(n) for n in names if n != effect.mechanism and n not in found.paired]
         rivals += [" together with ".join(map(plain, pair)) for pair in found.pairs]
         if rivals:
-            sentences.append(f"These tests cannot tell it from {listed(rivals, 'or')}.")
+            sentences.append(f"These tests cannot distinguish it from {listed(rivals, 'or')}.")
         if effect.misfit > 2 * DECISIONS.misfit:
             sentences.append(f"Its formula is off by about {100 * effect.misfit:.0f} % of the effect.")
     if found.closure is not None:
@@ -101,7 +101,7 @@ def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
     """What the addition did to the modulus: to that at the peaks, where formulas of the modulus take it elsewhere."""
     own, now, was = after["effective_modulus_MPa"], after[AT_PEAKS], before[AT_PEAKS]
     if is_unknown(now):
-        return f"With it these tests do not tell the effective modulus (95 % interval {interval(now, 1e-3)} GPa)."
+        return f"With it these tests do not determine the effective modulus (95 % interval {interval(now, 1e-3)} GPa)."
     where = "" if own["value"] == now["value"] else " at the peaks of these tests"
     return f"With it the effective modulus{where} is {with_sd(now, 1e-3)} GPa instead of {with_sd(was, 1e-3)} GPa."
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -15,8 +14,9 @@ from matplotlib.patches import Patch
 
 from .._errors import InputError
 from .._format import plain
+from ..calibrate.estimates import quantities
+from ..calibrate.population import COEFFICIENTS
 from ..discovery import Discovery
-from ..discovery.locate import Place
 from ..discovery.settings import DETECTABLE
 from . import style
 from .curves import plot_bands, plot_before_after
@@ -27,13 +27,7 @@ _FLOOR: style.Look = {"color": style.BLACK, "linestyle": "--", "linewidth": 1.0}
 
 
 def discovery_figures(found: Discovery) -> dict[str, Figure]:
-    """Every figure of a discovery, by the stem of its file's name.
-
-    Returns:
-        `discovery_where`, `discovery_before_after`, `discovery_ranking`, `discovery_gap`, `discovery_similarity`,
-        `discovery_shifts`; none if the base law could not be fitted; no gap and no shifts if nothing was added. Of the
-        posterior of the law with what was added, if there is one: `discovery_bands`, `discovery_prior_posterior`.
-    """
+    """Every figure of a discovery that can be drawn, by the stem of its file's name; none without a fit of the law."""
     if found.residuals is None:
         return {}
     figures = {
@@ -55,7 +49,7 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
 def _finished(figure: Figure, found: Discovery, **more: Any) -> Figure:
     if found.base is None:
         raise InputError("the base law was not fitted; there is nothing to draw")
-    return style.finish(figure, found.base.campaign.metadata, **more)
+    return style.finish(figure, found.base.campaign, **more)
 
 
 @style.styled
@@ -74,32 +68,26 @@ def plot_where(found: Discovery) -> Figure:
     colours = style.sequential(np.array([0.0, largest]))
     colours.set_cmap("YlOrBr")
     for place, share in zip(found.places, shares, strict=True):
-        _box(ax, kinds.index(place.segment), place, float(share), largest, colours)
+        row, (low, high) = kinds.index(place.segment), place.load_fraction
+        bar: style.Look = {"width": high - low, "left": low, "height": 0.86}
+        if not np.isfinite(share):
+            ax.barh(row, color="white", edgecolor="#D0D0D0", hatch="////", linewidth=0, **bar)
+            continue
+        ax.barh(row, color=colours.to_rgba(share), edgecolor="white", linewidth=1, **bar)
+        if share >= 0.01:
+            words = f"{100 * share:.0f} % {'↑' if place.sign > 0 else '↓'}"
+            ink = "white" if 0.6 * largest < share else style.BLACK
+            ax.text((low + high) / 2, row, words, ha="center", va="center", fontsize=style.SMALL, color=ink)
     ax.set_yticks(range(len(kinds)), kinds)
-    ax.set_ylim(len(kinds) - 0.45, -0.55)
-    ax.set_xlim(0, 1)
-    ax.set_xlabel("force over the test's largest force [-]")
+    ax.set(xlim=(0, 1), ylim=(len(kinds) - 0.45, -0.55), xlabel="force over the test's largest force [-]")
     ax.tick_params(axis="y", length=0)
     ax.spines[:].set_visible(False)
     nothing = found.verdict == "NO_GAP"
     what = "share of what noise leaves [-]" if nothing else "share of the systematic gap [-]"
     figure.colorbar(colours, ax=ax, label=what)
     title = "Where law and tests disagree" + (": nowhere beyond noise" if nothing else "")
-    lines = ["These are shares of what noise alone leaves: no gap was found."] if nothing else []
-    return _finished(figure, found, title=title, lines=lines)
-
-
-def _box(ax: Axes, row: int, place: Place, share: float, largest: float, colours: ScalarMappable) -> None:
-    low, high = place.load_fraction
-    bar: style.Look = {"width": high - low, "left": low, "height": 0.86}
-    if not np.isfinite(share):
-        ax.barh(row, color="white", edgecolor="#D0D0D0", hatch="////", linewidth=0, **bar)
-        return
-    ax.barh(row, color=colours.to_rgba(np.array(share)), edgecolor="white", linewidth=1, **bar)
-    if share >= 0.01:
-        words = f"{100 * share:.0f} % {'↑' if place.sign > 0 else '↓'}"
-        ink = "white" if 0.6 * largest < share else style.BLACK
-        ax.text((low + high) / 2, row, words, ha="center", va="center", fontsize=style.SMALL, color=ink)
+    warnings = ["These are shares of what noise alone leaves: no gap was found."] if nothing else []
+    return _finished(figure, found, title=title, warnings=warnings)
 
 
 def _with_unit(value: float, unit: str) -> str:
@@ -111,10 +99,8 @@ def plot_ranking(found: Discovery) -> Figure:
     """Every mechanism's statistic [-]: the estimate of its best formula alone over its standard error.
 
     The dashed line is the detection limit: a mechanism whose true strength reaches it is found with 95 % probability.
-    Next to each bar are its probability among all, the estimate, and the limit in the mechanism's own unit. Bars of
-    the set (what explains the gap as well as the best) are blue. An empty bar is an estimate of the physically
-    impossible sign, which explains nothing. Mechanisms that these data cannot show are below, grey, with what they
-    need.
+    Next to each bar are its probability among all, the estimate, and the limit in the mechanism's own unit. An empty
+    bar is an estimate of the physically impossible sign. Below, grey: mechanisms that these data cannot show.
     """
     entries = found.to_json()["ranking"]
     members = {name for names in found.candidate_set for name in names}
@@ -124,16 +110,20 @@ def plot_ranking(found: Discovery) -> Figure:
     ax = figure.subplots()
     column: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
     scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
-    any_impossible = False
+    kinds = {
+        "added to the law": {"color": style.BLUE},
+        "explains it as well": {"color": style.SKY},
+        "others": {"color": style.PALE},
+        "impossible sign": {"facecolor": "white", "edgecolor": style.PALE},
+    }
+    seen = {"others"}
     for row, entry in enumerate(entries):
         name, unit = entry["mechanism"], entry["unit"]
-        impossible = entry["sign"] * entry["statistic"] < 0
-        any_impossible = any_impossible or impossible
-        colour = (
-            style.PALE if impossible else style.BLUE if name in named else style.SKY if name in members else style.PALE
-        )
-        look: style.Look = {"color": "white" if impossible else colour, "edgecolor": colour, "linewidth": 0.9}
-        ax.barh(row, abs(entry["statistic"]), height=0.66, **look)
+        kind = "added to the law" if name in named else "explains it as well" if name in members else "others"
+        if entry["sign"] * entry["statistic"] < 0:
+            kind = "impossible sign"
+        seen.add(kind)
+        ax.barh(row, abs(entry["statistic"]), height=0.66, linewidth=0.9, **kinds[kind])
         chance = f"{entry['probability']:.2f}" if entry["probability"] >= 0.005 else "< 0.01"
         ax.text(1.1, row, chance, ha="right", **column)
         limit = _with_unit(entry["detection_limit"], unit)
@@ -146,21 +136,13 @@ def plot_ranking(found: Discovery) -> Figure:
     ax.set_yticks(range(count), [plain(e["mechanism"]) for e in (*entries, *found.untestable)])
     for tick in ax.get_yticklabels()[len(entries) :]:
         tick.set_color(style.GREY)
-    ax.set_ylim(count - 0.4, -0.6)
-    ax.set_xlim(0, 1.05 * scale)
+    ax.set(xlim=(0, 1.05 * scale), ylim=(count - 0.4, -0.6))
     ax.tick_params(axis="y", length=0)
     ax.set_xlabel("|estimate| / standard error, each mechanism alone [-]")
     header: style.Look = {"transform": ax.transAxes, "va": "bottom", "fontsize": 8, "color": style.GREY}
     ax.text(1.1, 1.0, "probability", ha="right", **header)
     ax.text(1.13, 1.0, "estimate and detection limit", **header)
-    handles: list[Line2D | Patch] = []
-    if named:
-        handles.append(Patch(color=style.BLUE, label="added to the law"))
-    if members - named:
-        handles.append(Patch(color=style.SKY, label="explains it as well"))
-    handles.append(Patch(color=style.PALE, label="others"))
-    if any_impossible:
-        handles.append(Patch(facecolor="white", edgecolor=style.PALE, label="impossible sign"))
+    handles: list[Line2D | Patch] = [Patch(label=kind, **look) for kind, look in kinds.items() if kind in seen]
     handles.append(Line2D([], [], label="detection limit", **_FLOOR))
     title = "What could be missing: no gap was found" if found.verdict == "NO_GAP" else "What explains the gap"
     return _finished(figure, found, title=title, handles=handles)
@@ -213,16 +195,12 @@ def plot_gap(found: Discovery) -> Figure:
     labels = ["law alone", *(f"+ {plain(s['added'])}" for s in steps[1:])]
     colours = [style.VERMILION, *([style.BLUE] * (len(steps) - 1))]
     for ax, key, label, form, floor in (
-        (left, "chi2_per_dof", "χ² per point [-]", ".2f", 1.0),
-        (right, "systematic_um", "systematic gap [µm]", ".2g", 0.0),
+        (left, "chi2_per_dof", "χ² per point [-]", "{:.2f}", 1.0),
+        (right, "systematic_um", "systematic gap [µm]", "{:.2g}", 0.0),
     ):
         values = np.array([s[key] for s in steps], float)
-        ax.bar(range(len(steps)), values, width=0.55, color=colours)
-        for i, value in enumerate(values):
-            ax.text(i, value, f" {value:{form}}", ha="center", va="bottom", fontsize=8)
-        ax.set_xticks(range(len(steps)), labels)
-        ax.set_xlim(-0.6, len(steps) - 0.4)
-        ax.set_ylabel(label)
+        ax.bar_label(ax.bar(labels, values, width=0.55, color=colours), fmt=form, fontsize=8)
+        ax.set(xlim=(-0.6, len(steps) - 0.4), ylabel=label)
         ax.margins(y=0.14)
         ax.axhline(floor, **_FLOOR)
     if gap["closed_fraction"] is not None:
@@ -234,26 +212,29 @@ def plot_gap(found: Discovery) -> Figure:
 @style.styled
 def plot_shifts(found: Discovery) -> Figure:
     """What the missing effect had done to the law: its parameters before and after, with 95 % intervals."""
+    sides = [("law alone", style.VERMILION, found.parameters_before)]
+    if found.parameters_after:
+        sides.append(("with what was added", style.BLUE, found.parameters_after))
+    names = ("a", "effective_modulus_MPa", *(f"{name}_median" for name in COEFFICIENTS))
     figure = style.new_figure(9.0, 2.6)
-    names = ("$a$ [-]", r"$\bar E$ [GPa]", "mean log $C_1$ [-]", "mean log $C_3$ [-]", "mean log $C_5$ [-]")
-    both = ((0, style.VERMILION, found.parameters_before), (1, style.BLUE, found.parameters_after))
-    for j, (ax, name) in enumerate(zip(figure.subplots(1, 5), names, strict=True)):
-        for x, colour, p in ((x, colour, p) for x, colour, p in both if p):
-            estimates = (p["a"], p["effective_modulus_MPa"], *(p[f"log_{c}"]["mean"] for c in ("C1", "C3", "C5")))
-            factor = 1e-3 if j == 1 else 1.0
-            ax.plot(x, estimates[j]["value"] * factor, "o", color=colour, markersize=5)
-            if estimates[j]["interval_95"] is not None:
-                ax.vlines(x, *(end * factor for end in estimates[j]["interval_95"]), color=colour, linewidth=1.8)
-        ax.set_xlim(-0.6, 1.6 if found.parameters_after else 0.6)
-        labels = ["before", "after"] if found.parameters_after else ["law alone"]
-        ax.set_xticks(range(len(labels)), labels)
-        ax.set_title(name, fontsize=8.5)
+    panels = dict(zip(names, figure.subplots(1, len(names)), strict=True))
+    for x, (_, colour, parameters) in enumerate(sides):
+        for one in quantities(parameters):
+            ax, value, ends = panels.get(one.name), one.estimate["value"], one.estimate["interval_95"]
+            if ax is None or value is None:
+                continue
+            ax.plot(x, value * one.factor, "o", color=colour, markersize=5)
+            if ends is not None:
+                ax.vlines(x, *(end * one.factor for end in ends), color=colour, linewidth=1.8)
+            ax.set_title(f"{one.label} [{one.unit or '-'}]", fontsize=8.5)
+    labels = ["before", "after"] if found.parameters_after else ["law alone"]
+    for ax in panels.values():
+        ax.set_xlim(-0.6, len(sides) - 0.4)
+        ax.set_xticks(range(len(sides)), labels)
         ax.margins(y=0.15)
         ax.locator_params(axis="y", nbins=5)
         ax.grid(axis="y", color="#E6E6E6", linewidth=0.6)
     moved = found.parameters_after and (found.effects or found.closure)
     title = "What the missing effect had done to the law" if moved else "Parameters of the law"
-    handles = [Line2D([], [], color=style.VERMILION, marker="o", label="law alone, 95 %")]
-    if found.parameters_after:
-        handles.append(Line2D([], [], color=style.BLUE, marker="o", label="with what was added, 95 %"))
+    handles = [Line2D([], [], color=colour, marker="o", label=f"{label}, 95 %") for label, colour, _ in sides]
     return _finished(figure, found, title=title, handles=handles)

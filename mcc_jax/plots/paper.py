@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
+from matplotlib.ticker import ScalarFormatter
 
 from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ..calibrate.data import UNLOADED_FROM
+from ..calibrate.paper.loading import MasterCurve
 from ..calibrate.paper.modulus import collapsed_branches
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
@@ -35,15 +36,11 @@ _MEAN: style.Look = {
     "markeredgewidth": 0.4,
 }
 _BAND: style.Look = {"color": style.BLUE, "alpha": 0.25, "linewidth": 0}
+_SMALL: style.Look = {"fontsize": 7, "color": style.GREY}
 
 
 def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
-    """Every figure of the calibration, by the stem of its file's name.
-
-    Returns:
-        `curves`, `dimensions`, `collapse`, `master`, `law`, `particles` (then `particles_2`, ... with more than 20
-        particles), `elastic`, `residuals`.
-    """
+    """Every figure of the calibration by the stem of its file's name; more than 20 particles take several pages."""
     pages = range(1, particle_pages(calibration) + 1)
     return {
         "curves": plot_curves(calibration),
@@ -61,21 +58,15 @@ def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
 
 
 def adjusted_curve(calibration: PaperCalibration, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Strain [-] and stress [MPa] of a whole kept test after the offset step, unloading included.
-
-    The straight line of the offset step replaces everything before the threshold is first passed.
-    """
+    """Strain [-] and stress [MPa] of a whole kept test after the offset step, with its line up to the threshold."""
     campaign, adjustment = calibration.campaign, calibration.adjustment
     segments = adjustment.segments[index]
     stress, strain = stress_and_strain(campaign.curves[index], campaign.diameters_um[index], segments)
     strain = strain + adjustment.shift[index]
     if adjustment.threshold_MPa == 0:
         return strain, stress
-    touching = np.ones(len(stress), bool)
-    for segment in segments:
-        if segment.kind == "approach":
-            touching[segment.start : segment.stop] = False
-    first = int(np.argmax(touching & (stress > adjustment.threshold_MPa)))
+    approach = max((part.stop for part in segments if part.kind == "approach"), default=0)
+    first = approach + int(np.argmax(stress[approach:] > adjustment.threshold_MPa))
     corner = np.array([[0.0, adjustment.strain], [0.0, adjustment.threshold_MPa]])
     return np.concatenate([corner[0], strain[first:]]), np.concatenate([corner[1], stress[first:]])
 
@@ -94,13 +85,10 @@ def _chosen(calibration: PaperCalibration, particles: Sequence[str] | None, eta:
 def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None = None) -> Figure:
     """Stress [MPa] over strain [-] of some tests, loading and unloading, before and after the offset step.
 
-    Solid: force and displacement as measured, divided by the area of the effective diameter and by that diameter,
-    from first contact. Dashed: the same after the offset step, with its straight line up to the threshold. The right
-    panel enlarges the threshold; without an offset step there are no dashed lines. Follows the paper's figure of raw
-    and adjusted curves of particles 1 to 3.
-
-    By default up to three kept particles over the range of shape factors are shown. Particles that were not kept have
-    no dashed line. More than seven are coloured by shape factor in place of a legend.
+    Solid: as measured, from first contact. Dashed: after the offset step, with its straight line up to the threshold,
+    which the right panel enlarges; particles that were not kept have no dashed line. Follows the paper's figure of raw
+    and adjusted curves. By default up to three kept particles over the range of shape factors are shown; more than
+    seven are coloured by shape factor.
     """
     campaign, adjustment, eta = calibration.campaign, calibration.adjustment, style.shape_factors(calibration)
     threshold = adjustment.threshold_MPa
@@ -110,19 +98,17 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
     figure = style.new_figure(7.6, 3.9)
     whole, toe = figure.subplots(1, 2, width_ratios=[1.45, 1])
     handles: list[Line2D] = []
-    ends, highest, width = [0.0, 4 * adjustment.strain], 0.0, style.faintness(len(chosen))
+    ends, width = [0.0, 4 * adjustment.strain], style.faintness(len(chosen))
     for i, colour in zip(chosen, colours.to_rgba(eta[chosen]) if many else _CYCLE, strict=False):
+        kept = adjustment.kept[i]
         stress, strain = stress_and_strain(campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i])
-        adjusted = adjusted_curve(calibration, i) if adjustment.kept[i] and threshold > 0 else None
         for ax in (whole, toe):
             ax.plot(strain, stress, color=colour, **width)
-            if adjusted is not None:
-                ax.plot(*adjusted, color=colour, **_DASHED, **width)
-        suffix = "" if adjustment.kept[i] else ", not used"
-        highest = max(highest, float(stress.max()))
+            if kept and threshold > 0:
+                ax.plot(*adjusted_curve(calibration, i), color=colour, **_DASHED, **width)
         passed = int(np.argmax(stress > 3 * threshold)) or len(stress)
-        first = strain[:passed][stress[:passed] > threshold / 4]
-        ends += [float(first.min()), float(first.max())] if len(first) else []
+        ends += strain[:passed][stress[:passed] > threshold / 4].tolist()
+        suffix = "" if kept else ", not used"
         handles.append(Line2D([], [], color=colour, label=f"{labels[i]}{suffix} ($\\eta_p$ = {eta[i]:.2f})"))
     styles = [Line2D([], [], color=style.GREY, label="as measured")]
     if threshold > 0:
@@ -130,23 +116,19 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
     if many:
         figure.colorbar(colours, ax=toe, label=style.SHAPE_FACTOR)
     whole.legend(handles=styles if many else handles + styles, loc="upper left")
+    whole.set_ylim(bottom=min(0.0, whole.dataLim.ymin))
+    whole.set(title="whole test", xlabel=style.STRAIN, ylabel=style.STRESS)
+    toe.set(xlabel=style.STRAIN, ylabel=style.STRESS)
     if threshold > 0:
         for ax in (whole, toe):
             ax.axhline(threshold, **_DOTTED)
         toe.axvline(adjustment.strain, **_DOTTED)
-        toe.set_ylim(0, 3 * threshold)
-        toe.set_xlim(min(ends), max(*ends, 1e-6))
+        toe.set(xlim=(min(ends), max(*ends, 1e-6)), ylim=(0, 3 * threshold))
         toe.set_title(f"threshold {threshold:g} MPa, mean strain {adjustment.strain:.3f}")
     else:
+        toe.set(xlim=(0, 0.1 * whole.get_xlim()[1]), ylim=(0, 0.1 * whole.get_ylim()[1]))
         toe.set_title("beginning (no offset step)")
-        toe.set_xlim(0, 0.1 * whole.get_xlim()[1])
-        toe.set_ylim(0, 0.1 * whole.get_ylim()[1])
-    whole.set_title("whole test")
-    if whole.dataLim.ymin > -0.02 * highest:
-        whole.set_ylim(bottom=0)
-    for ax in (whole, toe):
-        ax.set(xlabel=style.STRAIN, ylabel=style.STRESS)
-    return style.finish(figure, campaign.metadata)
+    return style.finish(figure, campaign)
 
 
 # ---- dimensions ------------------------------------------------------------------------------------------------------
@@ -168,8 +150,7 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     """Effective diameter D_e = D1 D2 / D3 over average diameter (D1 + D2 + D3)/3 [um], one point per particle.
 
     With the line 1:1, the line through the origin fitted to the data, and the mean ratio both ways with its standard
-    deviation. Colour is D3 over the geometric mean of D1 and D2: flat particles lie high. Follows the paper's figure
-    of dimensions, but says what the data give; for the paper's own table the ratios are 1.31 and 0.78, not 1.5.
+    deviation; for the paper's own table these are 1.31 and 0.78, not 1.5. Flat particles lie high.
     """
     sizes = dimensions(campaign)
     average, effective = sizes.average_um.to_numpy(), sizes.effective_um.to_numpy()
@@ -182,26 +163,21 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     ends = np.array([0.0, right])
     ax.plot(ends, ends, color=style.GREY, linewidth=1.0, dashes=(4, 2), label="1:1")
     ax.plot(ends, slope * ends, color=style.VERMILION, label=f"fit through the origin, $D_e$ = {slope:.3f} × average")
-    ax.scatter(
-        average, effective, c=colours.to_rgba(flat), s=28, edgecolors=style.BLACK,
-        linewidths=0.5, alpha=0.9, zorder=3, label=f"particles ({len(campaign)})",
-    )  # fmt: skip
+    rings: style.Look = {"s": 28, "edgecolors": style.BLACK, "linewidths": 0.5, "alpha": 0.9, "zorder": 3}
+    ax.scatter(average, effective, c=colours.to_rgba(flat), label=f"particles ({len(campaign)})", **rings)
     figure.colorbar(colours, ax=ax, label="$D_3/\\sqrt{D_1 D_2}$ [-]")
-    ax.set_xlim(0, right)
-    ax.set_ylim(0, max(1.08 * float(effective.max()), right, slope * right))
+    ax.set(xlim=(0, right), ylim=(0, max(1.08 * float(effective.max()), right, slope * right)))
     ax.set_xlabel("average diameter $(D_1 + D_2 + D_3)/3$ [µm]")
     ax.set_ylabel("effective diameter $D_e = D_1 D_2/D_3$ [µm]")
     ax.legend(loc="upper left")
     lines = []
-    for name, ratio in (
-        ("$D_e$/average", sizes.effective_over_average),
-        ("average/$D_e$", sizes.average_over_effective),
-    ):
+    for name, column in (("$D_e$/average", "effective_over_average"), ("average/$D_e$", "average_over_effective")):
+        ratio = sizes[column]
         lines.append(f"mean of {name}: {ratio.mean():.2f}" + (f" ± {ratio.std():.2f}" if len(ratio) > 1 else ""))
     if len(sizes) > 2 and sizes.average_um.nunique() > 1 and sizes.effective_um.nunique() > 1:
         lines.append(f"correlation: {sizes.average_um.corr(sizes.effective_um):.2f}")
     style.note(ax, "\n".join(lines), place="lower right")
-    return style.finish(figure, campaign.metadata)
+    return style.finish(figure, campaign)
 
 
 # ---- shape factor, master curve, law ---------------------------------------------------------------------------------
@@ -211,10 +187,9 @@ def plot_dimensions(campaign: Campaign) -> Figure:
 def plot_collapse(calibration: PaperCalibration) -> Figure:
     """Stress [MPa] of all kept loading curves over strain [-] and over strain scaled by the shape factor [-].
 
-    Colour is the shape factor: sorted by colour on the left, mixed on the right if it does what it is for. The black
-    line is the mean, as far as all particles reach. Each panel gives the objective, the sum of squared relative
-    deviations from the mean (or from the reference particle). The paper prints no such figure; the right panel is its
-    master curve before averaging.
+    Sorted by colour on the left, mixed on the right if the shape factor does what it is for. The black line is the
+    mean, as far as all particles reach; the objective is the sum of squared relative deviations from it (or from the
+    reference particle).
     """
     table, fit = calibration.table, calibration.chosen_shape
     eta = table.shape_factor(calibration.a)
@@ -231,57 +206,53 @@ def plot_collapse(calibration: PaperCalibration) -> Figure:
         for curve, factor, colour in zip(curves, factors, colours.to_rgba(eta), strict=True):
             ax.plot(factor * curve.strain, curve.stress_MPa, color=colour, **style.faintness(len(eta)))
         mean = (factors[:, None] * table.strain[:, everyone]).mean(axis=0)
-        dashes: style.Look = {"linewidth": 1.8, "dashes": (2.5, 1.2)}
-        ax.plot(mean, table.stress_MPa[everyone], color=style.BLACK, label="mean of all particles", **dashes)
+        dashes: style.Look = {"color": style.BLACK, "linewidth": 1.8, "dashes": (2.5, 1.2)}
+        ax.plot(mean, table.stress_MPa[everyone], label="mean of all particles", **dashes)
         ax.set_xlim(left=0)
-        ax.set_xlabel(label)
-        ax.set_title(title)
+        ax.set(xlabel=label, title=title)
         ax.legend(loc="upper left", title=f"objective {value:.4g}", alignment="left", title_fontsize=8)
     panels[0].set_ylim(bottom=0)
     panels[0].set_ylabel(style.STRESS)
     figure.colorbar(colours, ax=panels.tolist(), label=style.SHAPE_FACTOR)
-    lines = [f"the fit of a did not succeed: {fit.reason}"] if fit.reason else []
-    return style.finish(figure, calibration.campaign.metadata, lines=lines)
+    warnings = [f"the fit of a did not succeed: {fit.reason}"] if fit.reason else []
+    return style.finish(figure, calibration.campaign, warnings=warnings)
 
 
 @style.styled
 def plot_master(calibration: PaperCalibration) -> Figure:
-    """Mean (symbols) and one standard deviation (band) of the scaled strain [-] over stress [MPa].
+    """Mean (symbols) and one standard deviation (band) of the scaled strain [-] over stress [MPa], as in the paper.
 
     Faint lines are the single particles' adjusted loading curves, scaled by their shape factors; the lower panel
     counts the particles that reach a stress. Mean and band end where no more than a fifth of the particles is left.
-    Follows the paper's figure of the master contact law as a distribution of strain.
     """
     master, table = calibration.master, calibration.table
     eta = table.shape_factor(calibration.a)
     figure = style.new_figure(5.6, 4.9)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3.4, 1])
+    single = np.where(table.reached, eta[:, None] * table.strain, np.nan)
+    labels = ["single particles", *["_"] * (len(eta) - 1)]
     thin = style.faintness(len(eta)) | {"linewidth": 0.6}
-    for row, factor in enumerate(eta):
-        reached = table.reached[row]
-        line = upper.plot(table.stress_MPa[reached], factor * table.strain[row, reached], color=style.PALE, **thin)[0]
-        line.set_label("single particles" if row == 0 else "_")
-    known = np.isfinite(master.sd)
-    low, high = ((master.mean + sign * master.sd)[known] for sign in (-1, 1))
-    upper.fill_between(master.stress_MPa[known], low, high, label="mean ± 1 sd", **_BAND)
+    upper.plot(table.stress_MPa, single.T, color=style.PALE, label=labels, **thin)
+    upper.fill_between(master.stress_MPa, *_sample_band(master), label="mean ± 1 sd", **_BAND)
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
     upper.plot(master.stress_MPa, master.mean, markevery=step, label="mean", **_MEAN)
-    upper.set_ylabel(style.SCALED_STRAIN)
     upper.set_ylim(bottom=0)
+    upper.set_ylabel(style.SCALED_STRAIN)
     upper.legend(loc="lower right")
     style.note(upper, f"a = {calibration.a:.2f}, {len(eta)} particles")
     lower.fill_between(table.stress_MPa, table.reached.sum(axis=0), step="mid", color=style.PALE, linewidth=0)
     lower.plot(master.stress_MPa, master.count, color=style.BLUE, drawstyle="steps-mid")
-    fifth = len(eta) / 5
-    lower.axhline(fifth, **_DOTTED)
-    lower.set_ylim(0, 1.12 * len(eta))
-    lower.set_xlim(0, 1.02 * table.stress_MPa[-1])
+    lower.axhline(len(eta) / 5, **_DOTTED)
+    lower.annotate("one fifth", (0.01, len(eta) / 5), xycoords=("axes fraction", "data"), va="bottom", **_SMALL)
     lower.yaxis.get_major_locator().set_params(integer=True)
+    lower.set(xlim=(0, 1.02 * table.stress_MPa[-1]), ylim=(0, 1.12 * len(eta)))
     lower.set(xlabel=style.STRESS, ylabel="particles [-]")
-    lower.text(
-        0.01, fifth, "one fifth", transform=lower.get_yaxis_transform(), va="bottom", fontsize=7, color=style.GREY
-    )
-    return style.finish(figure, calibration.campaign.metadata)
+    return style.finish(figure, calibration.campaign)
+
+
+def _sample_band(master: MasterCurve) -> tuple[np.ndarray, np.ndarray]:
+    """One standard deviation around the mean scaled strain; NaN where it is unknown."""
+    return master.mean - master.sd, master.mean + master.sd
 
 
 def law_strain(calibration: PaperCalibration) -> np.ndarray:
@@ -291,10 +262,8 @@ def law_strain(calibration: PaperCalibration) -> np.ndarray:
 
 
 def stretches_outside(calibration: PaperCalibration) -> list[tuple[int, int]]:
-    """Where the mean law is more than one sample standard deviation of strain off, above the threshold.
-
-    First and last position on the master curve of every stretch of at least three points; fewer say nothing.
-    """
+    """First and last position on the master curve of every stretch of at least three points, above the threshold,
+    where the mean law is more than one sample standard deviation of strain off."""
     master = calibration.master
     with np.errstate(invalid="ignore"):
         off = np.abs(law_strain(calibration) - master.mean) > master.sd
@@ -303,22 +272,13 @@ def stretches_outside(calibration: PaperCalibration) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 3]
 
 
-def _where(stress: np.ndarray, stretches: list[tuple[int, int]]) -> str:
-    if not stretches:
-        return "mean law within ± 1 sd of the sample over the tested range"
-    shown = ", ".join(f"{stress[a]:.2g} to {stress[b]:.2g}" for a, b in stretches[:3])
-    more = f" and {len(stretches) - 3} more" if len(stretches) > 3 else ""
-    return f"mean law more than 1 sd off the sample at {shown} MPa{more}"
-
-
 @style.styled
 def plot_law(calibration: PaperCalibration) -> Figure:
     """Stress [MPa] over scaled strain [-] of plastic loading: the calibrated law and the sample it was fitted to.
 
     Solid: mean law; dashed: one standard deviation of stress under the population of C1, C3, C5; dash-dotted: first
     term alone. Symbols and band: mean and one standard deviation of the sample's strain; crosses where the mean law
-    lies outside that band. Grey beyond the largest scaled strain of any test, where the law extrapolates. Follows the
-    paper's figure of the master law as stress over strain.
+    lies outside that band. Grey beyond the largest scaled strain of any test, where the law extrapolates.
     """
     master, table = calibration.master, calibration.table
     population, plastic = calibration.plastic.population, calibration.mean_law.plastic
@@ -329,30 +289,32 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     figure = style.new_figure(5.6, 4.3)
     ax = figure.subplots()
     ax.axvspan(tested, right, color="#ECECEC", linewidth=0, label="beyond the tests")
-    known = np.isfinite(master.sd)
-    low, high = ((master.mean + sign * master.sd)[known] for sign in (-1, 1))
-    ax.fill_betweenx(master.stress_MPa[known], low, high, label="sample mean ± 1 sd of strain", **_BAND)
+    ax.fill_betweenx(master.stress_MPa, *_sample_band(master), label="sample mean ± 1 sd of strain", **_BAND)
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
     ax.plot(master.mean, master.stress_MPa, markevery=step, label="sample mean", **_MEAN)
-    ax.plot(x, mean, color=style.VERMILION, linewidth=1.6, label="mean law")
-    ax.plot(x, mean + sd, color=style.VERMILION, linewidth=1.0, dashes=(4, 2), label="± 1 sd of stress")
-    ax.plot(x, np.maximum(mean - sd, 0.0), color=style.VERMILION, linewidth=1.0, dashes=(4, 2))
+    law: style.Look = {"color": style.VERMILION, "linewidth": 1.0}
+    ax.plot(x, mean, label="mean law", **law | {"linewidth": 1.6})
+    ax.plot(x, mean + sd, label="± 1 sd of stress", dashes=(4, 2), **law)
+    ax.plot(x, np.maximum(mean - sd, 0.0), dashes=(4, 2), **law)
     ax.plot(x, float(plastic.C1) * x, color=style.GREY, linewidth=1.1, dashes=(5, 1.5, 1, 1.5), label="first term only")
-    stretches = stretches_outside(calibration)
+    ax.set(xlim=(0, right), ylim=(0, 1.25 * float(table.stress_MPa[-1])))
+    ax.set(xlabel=style.SCALED_STRAIN, ylabel=style.STRESS)
+    agreement, stretches = "within ± 1 sd of the sample over the tested range", stretches_outside(calibration)
     if stretches:
         shown = np.concatenate([np.arange(a, b + 1, max(1, step // 2)) for a, b in stretches])
-        at, cross = law_strain(calibration)[shown], {"color": style.ORANGE, "markersize": 5, "markeredgewidth": 1.3}
+        cross: style.Look = {"color": style.ORANGE, "markersize": 5, "markeredgewidth": 1.3}
+        at = law_strain(calibration)[shown]
         ax.plot(at, master.stress_MPa[shown], "x", label="law off by > 1 sd", **cross)
-    ax.set_xlim(0, right)
-    ax.set_ylim(0, 1.25 * float(table.stress_MPa[-1]))
-    ax.set(xlabel=style.SCALED_STRAIN, ylabel=style.STRESS)
+        ends = ", ".join(f"{master.stress_MPa[a]:.2g} to {master.stress_MPa[b]:.2g}" for a, b in stretches[:3])
+        more = f" and {len(stretches) - 3} more" if len(stretches) > 3 else ""
+        agreement = f"more than 1 sd off the sample at {ends} MPa{more}"
     factors = [f"{float(f'{K:.3g}'):.6g}" for K in calibration.plastic.polynomial]
     text = "$\\sigma$/MPa = {} $x$ − {} $x^3$ + {} $x^5$,  $x = \\eta_p\\,\\varepsilon$".format(*factors)
-    ax.set_title(text + "\n" + _where(master.stress_MPa, stretches), fontsize=8.5)
+    ax.set_title(f"{text}\nmean law {agreement}", fontsize=8.5)
     ax.legend(loc="upper left")
     if calibration.plastic.at_bound:
         style.note(ax, "at its lower bound:\n" + "\n".join(calibration.plastic.at_bound), place="lower right")
-    return style.finish(figure, calibration.campaign.metadata)
+    return style.finish(figure, calibration.campaign)
 
 
 # ---- unloading, residuals --------------------------------------------------------------------------------------------
@@ -364,8 +326,7 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
 
     Left: stress over peak stress [-] against recovered over recoverable strain [-], with the law's universal curve.
     Right: the effective modulus [GPa] of each branch alone over its peak stress [MPa], with the fitted one; it
-    belongs to the form of unloading. Colour is the shape factor. The paper shows unloading only within its figures of
-    single particles.
+    belongs to the form of unloading.
     """
     fit, law = calibration.elastic, calibration.mean_law
     figure = style.new_figure(7.8, 3.7)
@@ -374,7 +335,7 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     if modulus is None:
         for ax in (left, right):
             style.empty(ax, fit.reason or "no effective modulus")
-        return style.finish(figure, calibration.campaign.metadata)
+        return style.finish(figure, calibration.campaign)
     every_eta = style.shape_factors(calibration)
     eta = every_eta[[b.particle for b in fit.branches]]
     colours = style.sequential(eta)
@@ -385,15 +346,13 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     for (recovered, ratio), colour in zip(branches, rgba, strict=True):
         left.plot(recovered, ratio, ".", color=colour, **dots)
     s = np.linspace(0.0, 1.0, 201)
-    left.plot(
-        s, np.asarray(jax.jit(stress_ratio)(jnp.asarray(s))), color=style.BLACK, linewidth=1.0, label="law, $f(s)$"
-    )
+    ratio = np.asarray(jax.jit(stress_ratio)(jnp.asarray(s)))
+    left.plot(s, ratio, color=style.BLACK, linewidth=1.0, label="law, $f(s)$")
     left.axhline(UNLOADED_FROM, **_DOTTED)
-    words: style.Look = {"transform": left.get_yaxis_transform(), "va": "bottom", "fontsize": 7, "color": style.GREY}
-    left.text(0.02, UNLOADED_FROM, "each branch has a zero of its own;\nnot used below", **words)
+    words = "each branch has its own zero;\nnot used below"
+    left.annotate(words, (0.02, UNLOADED_FROM), xycoords=("axes fraction", "data"), va="bottom", **_SMALL)
     left.set_xlabel("recovered strain over recoverable strain $s$ [-]")
-    left.set_ylabel("stress over peak stress $\\sigma/\\sigma_P$ [-]")
-    left.set_ylim(0, 1.05)
+    left.set(ylabel="stress over peak stress $\\sigma/\\sigma_P$ [-]", ylim=(0, 1.05))
     left.legend(loc="upper right")
     left.set_title(f"{len(fit.branches)} branches, rms strain {fit.rms_strain:.2g}")
     single = fit.per_branch_MPa / 1e3
@@ -404,37 +363,36 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     right.axhline(modulus / 1e3, color=style.VERMILION, label=f"all branches, {modulus / 1e3:.3g} GPa", zorder=2)
     if known.any() and single[known].max() > 5 * single[known].min():
         right.set_yscale("log")
-        wide = single[known].max() > 100 * single[known].min()
-        for setter in (right.yaxis.set_major_formatter, right.yaxis.set_minor_formatter):
-            setter(LogFormatterSciNotation() if wide else ScalarFormatter())
+        if single[known].max() < 100 * single[known].min():
+            right.yaxis.set_major_formatter(ScalarFormatter())
+            right.yaxis.set_minor_formatter(ScalarFormatter())
     else:
-        span = np.append(single[known], modulus / 1e3)
-        margin = max(0.15 * np.ptp(span), 0.02 * modulus / 1e3)
-        right.set_ylim(span.min() - margin, span.max() + 2.5 * margin)
+        right.margins(y=0.15)
+        style.headroom(right, 0.2)
     missing = int((~known).sum())
     if missing:
-        style.note(right, f"{missing} {'branch gives' if missing == 1 else 'branches give'} no modulus alone",
-             place="lower right")  # fmt: skip
+        plural = "branch gives" if missing == 1 else "branches give"
+        style.note(right, f"{missing} {plural} no modulus alone", place="lower right")
     right.set(xlabel="peak stress $\\sigma_P$ [MPa]", ylabel="effective modulus [GPa]")
     right.set_title(f"form of unloading: {law.unloading.value.replace('_', ' ')}")
     right.legend(loc="best" if right.get_yscale() == "log" else "upper left")
     figure.colorbar(colours, ax=[left, right], label=style.SHAPE_FACTOR)
-    return style.finish(figure, calibration.campaign.metadata)
+    return style.finish(figure, calibration.campaign)
 
 
 @style.styled
 def plot_residuals(calibration: PaperCalibration) -> Figure:
     """Measured less predicted displacement [um] over force [mN, logarithmic], one line per kept particle.
 
-    Above by the mean law: mostly the scatter of the particles' material. Below by each particle's own C1, C3, C5, on
-    a scale of its own: what the form of the law itself misses. Level stretches are unloading, which keeps the
-    deviation of its peak. The orange band is the noise from point to point, plus and minus one standard deviation; a
-    law that described everything would leave only that. The paper has no such figure.
+    Above by the mean law: mostly the scatter of the particles' material. Below by each particle's own C1, C3, C5: what
+    the form of the law itself misses. Level stretches are unloading, which keeps the deviation of its peak. The orange
+    band is the noise from point to point, plus and minus one standard deviation.
     """
     campaign, noise = calibration.campaign, calibration.displacement_noise_um
     fits = [(i, fit) for i, fit in enumerate(calibration.particles) if fit is not None]
     eta = style.shape_factors(calibration)[[i for i, _ in fits]]
     colours = style.sequential(eta)
+    thin = style.faintness(len(fits)) | {"linewidth": 0.8}
     figure = style.new_figure(6.4, 5.2)
     panels = figure.subplots(2, 1, sharex=True)
     for ax, name, title, rms in (
@@ -444,16 +402,10 @@ def plot_residuals(calibration: PaperCalibration) -> Figure:
         for (i, fit), colour in zip(fits, colours.to_rgba(eta), strict=True):
             # A gap, not a line, where points do not count.
             deviation = np.where(fit.used, fit.measured_um - getattr(fit, name), np.nan)
-            ax.plot(
-                campaign.curves[i].force_mN,
-                deviation,
-                color=colour,
-                **(style.faintness(len(fits)) | {"linewidth": 0.8}),
-            )
+            ax.plot(campaign.curves[i].force_mN, deviation, color=colour, **thin)
         ax.axhline(0.0, color=style.GREY, linewidth=0.8)
         ax.axhspan(-noise, noise, color=style.ORANGE, alpha=0.6, linewidth=0, zorder=3)
-        ax.set_ylabel("measured − predicted [µm]")
-        ax.set_title(title)
+        ax.set(ylabel="measured − predicted [µm]", title=title)
         typical, point = np.nanmedian([getattr(fit, rms) for _, fit in fits]), f"{noise:.2g}" if noise > 1e-9 else "0"
         style.note(ax, f"median rms {typical:.2g} µm; point noise (orange) ± {point} µm", place="upper right")
         style.headroom(ax, 0.14)
@@ -461,4 +413,4 @@ def plot_residuals(calibration: PaperCalibration) -> Figure:
     panels[1].set_xscale("log")
     panels[1].xaxis.set_major_formatter(ScalarFormatter())
     figure.colorbar(colours, ax=panels.tolist(), label=style.SHAPE_FACTOR)
-    return style.finish(figure, campaign.metadata)
+    return style.finish(figure, campaign)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from arviz_stats.base.array import array_stats
@@ -30,55 +30,38 @@ _SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
 _PAPER: style.Look = {"color": style.VERMILION, "dashes": (3, 1.5)}
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """How a parameter of the population is shown.
-
-    Attributes:
-        label: symbol and unit.
-        meaning: in words, given once for those that are alike.
-        scale: what its numbers are multiplied with.
-        positive: it may pile up at 0.
-    """
-
-    label: str
-    meaning: str = ""
-    scale: float = 1.0
-    positive: bool = False
-
-
-PARAMETERS = {
-    "a": Parameter("$a$ [-]", "$a$: shape parameter"),
-    "effective_modulus_MPa": Parameter("$\\bar{E}$ [GPa]", "$\\bar{E}$: effective modulus", scale=1e-3),
-    "mu_C1": Parameter("$\\mu_1$ [-]", "$\\mu_j$: mean of log $C_j$"),
-    "tau_C1": Parameter("$\\tau_1$ [-]", "$\\tau_j$: its standard deviation over the particles", positive=True),
-    "mu_C3": Parameter("$\\mu_3$ [-]"),
-    "tau_C3": Parameter("$\\tau_3$ [-]", positive=True),
-    "mu_C5": Parameter("$\\mu_5$ [-]"),
-    "tau_C5": Parameter("$\\tau_5$ [-]", positive=True),
-    "modulus_scatter": Parameter("$s_E$ [-]", "$s_E$: standard deviation of log modulus", positive=True),
-    "shape_scatter": Parameter("$s_a$ [-]", "$s_a$: standard deviation of $a$", positive=True),
-    "noise_factor": Parameter("noise factor [-]"),
+LABELS = {
+    "a": "$a$ [-]",
+    "effective_modulus_MPa": "$\\bar{E}$ [GPa]",
+    "mu_C1": "$\\mu_1$ [-]",
+    "tau_C1": "$\\tau_1$ [-]",
+    "mu_C3": "$\\mu_3$ [-]",
+    "tau_C3": "$\\tau_3$ [-]",
+    "mu_C5": "$\\mu_5$ [-]",
+    "tau_C5": "$\\tau_5$ [-]",
+    "modulus_scatter": "$s_E$ [-]",
+    "shape_scatter": "$s_a$ [-]",
+    "noise_factor": "noise factor [-]",
 }
-"""In the order in which they are drawn."""
+"""Parameters of the population in the order in which they are drawn."""
+MEANINGS = {
+    "a": "$a$: shape parameter",
+    "effective_modulus_MPa": "$\\bar{E}$: effective modulus",
+    "mu_C1": "$\\mu_j$: mean of log $C_j$",
+    "tau_C1": "$\\tau_j$: its standard deviation over the particles",
+    "modulus_scatter": "$s_E$: standard deviation of log modulus",
+    "shape_scatter": "$s_a$: standard deviation of $a$",
+}
 
 
 def posterior_figures(calibration: Posterior) -> dict[str, Figure]:
-    """Every figure of the posterior, by the stem of its file's name.
-
-    Returns:
-        `pairs`, `prior_posterior`, `forest`, `shrinkage`, `bands`, `new_particle`.
-    """
+    """Every figure of the posterior, by the stem of its file's name: `pairs` for `plot_pairs`."""
     plots = (plot_pairs, plot_prior_posterior, plot_forest, plot_shrinkage, plot_bands, plot_new_particle)
     return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
 
 
 def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
-    """Every figure of the joint least squares, by the stem of its file's name.
-
-    Returns:
-        `whitened`, `fits`, `estimates`.
-    """
+    """Every figure of the joint least squares, by the stem of its file's name: `fits` for `plot_fits`."""
     plots = (plot_whitened, plot_fits, plot_estimates)
     return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
 
@@ -88,7 +71,8 @@ def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
 
 def _scaled(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Draws in the order and the units of the figures."""
-    return {name: named[name] * p.scale for name, p in PARAMETERS.items() if name in named}
+    factors = {"effective_modulus_MPa": 1e-3}
+    return {name: named[name] * factors.get(name, 1.0) for name in LABELS if name in named}
 
 
 def density(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -111,9 +95,7 @@ def _mean_and_sd(draws: np.ndarray) -> str:
 def plot_pairs(calibration: Posterior) -> Figure:
     """Every pair of the population's parameters, one dot per draw; on the diagonal each alone, with mean and sd.
 
-    Shape parameter `a` [-], effective modulus [GPa], and mean and standard deviation of log C1, C3, C5 [-], with the
-    scatter of modulus and `a` where they may scatter. A slanting cloud is a combination that the data know better than
-    its parts.
+    A slanting cloud is a combination that the data determine better than its parts.
     """
     draws = _scaled(calibration.named_population())
     draws.pop("noise_factor", None)
@@ -124,28 +106,27 @@ def plot_pairs(calibration: Posterior) -> Figure:
     shown = style.every(draws["a"].size, DOTS)
     dots: style.Look = {"color": style.BLUE, "markersize": 2.5, "markeredgewidth": 0, "alpha": 0.45}
     for i, name in enumerate(names):
-        values, parameter = draws[name].ravel(), PARAMETERS[name]
-        for j, ax in enumerate(grid[i]):
-            if j > i:
-                ax.set_axis_off()
-                continue
-            if j == i:
-                _area(ax, *density(values), style.SKY, style.BLUE)
-                ax.set_ylim(0, 1.08)
-                ax.set_yticks([])
-                ax.spines["left"].set_visible(False)
-                ax.set_title(_mean_and_sd(values), fontsize=7, loc="center")
-            else:
-                ax.plot(draws[names[j]].ravel()[shown], values[shown], ".", **dots)
-                ax.yaxis.set_major_locator(MaxNLocator(3))
-                ax.tick_params(labelleft=j == 0)
-                ax.set_ylabel(parameter.label if j == 0 else "")
+        values = draws[name].ravel()
+        for other, ax in zip(names[:i], grid[i], strict=False):
+            ax.plot(draws[other].ravel()[shown], values[shown], ".", **dots)
+            ax.yaxis.set_major_locator(MaxNLocator(3))
+            ax.tick_params(labelleft=ax is grid[i, 0])
+        own = grid[i, i]
+        _area(own, *density(values), style.SKY, style.BLUE)
+        own.set(ylim=(0, 1.08), yticks=[])
+        own.spines["left"].set_visible(False)
+        own.set_title(_mean_and_sd(values), fontsize=7, loc="center")
+        if i:
+            grid[i, 0].set_ylabel(LABELS[name])
+        grid[-1, i].set_xlabel(LABELS[name])
+        for ax in grid[i:, i]:
             ax.xaxis.set_major_locator(MaxNLocator(3))
             ax.tick_params(axis="x", labelrotation=90)
-            ax.set_xlabel(PARAMETERS[names[j]].label if i == size - 1 else "")
+        for ax in grid[i, i + 1 :]:
+            ax.set_axis_off()
     figure.align_labels(list(grid.ravel()))
     corner = grid[0, -1]
-    for rank, meaning in enumerate(filter(None, (PARAMETERS[name].meaning for name in names))):
+    for rank, meaning in enumerate(MEANINGS[name] for name in names if name in MEANINGS):
         # Below each other in the empty corner, which shall not grow for them.
         place: style.Look = {"transform": corner.transAxes, "ha": "right", "va": "top", "fontsize": 8.5}
         corner.text(1, 1 - 0.25 * rank, meaning, **place).set_in_layout(False)
@@ -170,17 +151,15 @@ def plot_prior_posterior(calibration: Posterior) -> Figure:
     The paper has no value for the noise, the scatter of modulus and `a`, and for other forms of unloading no modulus.
     """
     posterior, prior = _scaled(calibration.named_population()), prior_of(calibration)
-    paper = {row["quantity"]: row["paper"] for row in compare_with_paper(calibration)}
-    rows = -(-len(posterior) // 2)
-    figure = style.new_figure(9.6, 1.5 * rows + 1.0)
-    grid = figure.subplots(rows, 4, squeeze=False)
-    for ax in grid.ravel()[2 * len(posterior) :]:
-        ax.set_axis_off()
-    for rank, ((name, values), (whole, near)) in enumerate(zip(posterior.items(), grid.reshape(-1, 2), strict=False)):
-        said = paper.get(name)
-        mark = None if said is None else said * PARAMETERS[name].scale
-        _prior_posterior(whole, near, prior[name], values, mark, PARAMETERS[name])
-        whole.set_ylabel("density / peak [-]" if rank % 2 == 0 else "")
+    paper = _scaled(
+        {row["quantity"]: row["paper"] for row in compare_with_paper(calibration) if row["paper"] is not None}
+    )
+    labels: style.Look = {"xlabels": ["", ""], "ylabel": "density / peak [-]"}
+    figure, panels = style.grid(len(posterior), 2, (4.8, 1.5), widths=(1.0, 1.0), **labels)
+    for (name, values), (whole, near) in zip(posterior.items(), panels, strict=True):
+        _prior_posterior(whole, near, prior[name], values, paper.get(name), spread="_scatter" in name or "tau" in name)
+        whole.set_xlabel(LABELS[name])
+        near.set_xlabel(LABELS[name])
     handles = [
         Patch(color=style.PALE, alpha=0.7, linewidth=0, label="prior"),
         Patch(color=style.SKY, alpha=0.7, linewidth=0, label="posterior"),
@@ -190,11 +169,12 @@ def plot_prior_posterior(calibration: Posterior) -> Figure:
 
 
 def _prior_posterior(
-    whole: Axes, near: Axes, prior: np.ndarray, posterior: np.ndarray, paper: float | None, parameter: Parameter
+    whole: Axes, near: Axes, prior: np.ndarray, posterior: np.ndarray, paper: float | None, *, spread: bool
 ) -> None:
+    """One parameter; a `spread` is a standard deviation between particles, whose prior may pile up at 0."""
     close = density(posterior)
     low, high = close[0][[0, -1]]
-    enlarged = enlarged_prior(prior, high, parameter)
+    enlarged = density(prior_near(prior, high) if spread else prior)
     reach = high - low
     inside = paper is not None and low - reach <= paper <= high + reach
     if inside:
@@ -205,11 +185,8 @@ def _prior_posterior(
         _area(ax, *before, style.PALE, style.GREY)
         _area(ax, *close, style.SKY, style.BLUE)
         margin = 0.02 * (x[1] - x[0])
-        ax.set_xlim(x[0] - margin, x[1] + margin)
-        ax.set_ylim(0, 1.1)
-        ax.set_yticks([0, 1])
+        ax.set(xlim=(x[0] - margin, x[1] + margin), ylim=(0, 1.1), yticks=[0, 1])
         ax.xaxis.set_major_locator(MaxNLocator(3))
-        ax.set_xlabel(parameter.label)
         if paper is not None and x[0] <= paper <= x[1]:
             ax.axvline(paper, linewidth=1.3, **_PAPER)
     near.set_yticks([])
@@ -218,35 +195,23 @@ def _prior_posterior(
         style.note(near, f"paper {paper:.4g}", place="upper left" if paper < low else "upper right")
 
 
-def enlarged_prior(prior: np.ndarray, end: float, parameter: Parameter) -> tuple[np.ndarray, np.ndarray]:
-    """The prior's density up to where the posterior ends.
-
-    That of a spread may pile up at 0 far within one kernel of all draws: then from those near by alone.
-    """
+def prior_near(prior: np.ndarray, end: float) -> np.ndarray:
+    """Draws of a prior up to where the posterior ends: it may pile up at 0 far within one kernel of all draws."""
     near = prior[prior <= 2 * end]
-    return density(near if parameter.positive and len(near) >= NEAR_DRAWS else prior)
+    return near if len(near) >= NEAR_DRAWS else prior
 
 
 # ---- the particles ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class CoefficientTable:
-    """C1, C3, C5 of N particles [-], and of the population.
+class CoefficientTable(NamedTuple):
+    """C1, C3, C5 of N particles [-] and of the population, without the 50 % interval and with NaN where unknown."""
 
-    Attributes:
-        centre: best value or median, shape (N, 3).
-        wide: ends of the 95 % interval, shape (2, N, 3); NaN where there is none.
-        narrow: ends of the 50 % interval, or None.
-        median: of the population, shape (3,).
-        spread: interval of 95 % of the particles, shape (2, 3).
-    """
-
-    centre: np.ndarray
-    wide: np.ndarray
-    narrow: np.ndarray | None
-    median: np.ndarray
-    spread: np.ndarray
+    centre: np.ndarray  # best value or median, shape (N, 3)
+    wide: np.ndarray  # ends of the 95 % interval, shape (2, N, 3)
+    narrow: np.ndarray | None  # ends of the 50 % interval
+    median: np.ndarray  # of the population, shape (3,)
+    spread: np.ndarray  # interval of 95 % of the particles, shape (2, 3)
 
 
 def posterior_table(calibration: Posterior) -> CoefficientTable:
@@ -268,31 +233,12 @@ def least_squares_table(calibration: LeastSquares) -> CoefficientTable:
     return CoefficientTable(centre, np.moveaxis(wide, -1, 0), None, np.exp(mu), spread)
 
 
-def _rows(ax: Axes, table: CoefficientTable, j: int, chosen: np.ndarray, y: np.ndarray, *, labelled: bool) -> None:
-    thick, size = (3.2, 4.0) if labelled else (1.2, 1.5)
-    ax.axvspan(*table.spread[:, j], color=style.ORANGE, alpha=0.22, linewidth=0, zorder=0)
-    ax.axvline(table.median[j], color=style.VERMILION, linewidth=1.1, zorder=1)
-    ax.hlines(
-        y, *table.wide[:, chosen, j], color=style.BLUE if table.narrow is None else style.SKY, linewidth=1.1, zorder=2
-    )
-    if table.narrow is not None:
-        ax.hlines(y, *table.narrow[:, chosen, j], color=style.BLUE, linewidth=thick, zorder=3)
-    ax.plot(table.centre[chosen, j], y, "o", color=style.BLACK, markersize=size, markeredgewidth=0, zorder=4)
-    ax.set_xlabel(f"{_SYMBOLS[j]} [-]")
-    ax.locator_params(axis="x", nbins=5)
-    ax.use_sticky_edges = False  # the band's ends are no limits of the axis
-    ax.margins(x=0.04)
-    # How wide intervals usually are: they may be narrower than their dots.
-    half = (table.wide[1] - table.wide[0])[:, j] / (2 * table.centre[:, j])
-    half = half[np.isfinite(half)]
-    typical = f"typical 95 % interval: ± {100 * np.median(half):.2g} %" if len(half) else "no intervals"
-    ax.set_title(typical, fontsize=8)
-
-
 def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure, list[Line2D | Patch]]:
     """Three panels of intervals, and the handles of their legend."""
-    count = len(labels)
+    count, single = len(labels), table.narrow is None
     labelled = count <= LABELLED
+    thick, size = (3.2, 4.0) if labelled else (1.2, 1.5)
+    outer = style.BLUE if single else style.SKY
     figure = style.new_figure(8.2, max(2.4, 0.19 * count + 1.3) if labelled else 6.0)
     panels = figure.subplots(1, 3, sharey=True)
     for j, ax in enumerate(panels):
@@ -300,18 +246,30 @@ def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure,
         if not labelled:
             chosen = np.argsort(table.centre[:, j], kind="stable")[style.spread_over(count, ROWS)]
             y = np.linspace(0, 1, len(chosen))
-        _rows(ax, table, j, chosen, y, labelled=labelled)
+        ax.axvspan(*table.spread[:, j], color=style.ORANGE, alpha=0.22, linewidth=0, zorder=0)
+        ax.axvline(table.median[j], color=style.VERMILION, linewidth=1.1, zorder=1)
+        ax.hlines(y, *table.wide[:, chosen, j], color=outer, linewidth=1.1, zorder=2)
+        if table.narrow is not None:
+            ax.hlines(y, *table.narrow[:, chosen, j], color=style.BLUE, linewidth=thick, zorder=3)
+        ax.plot(table.centre[chosen, j], y, "o", color=style.BLACK, markersize=size, markeredgewidth=0, zorder=4)
+        ax.set_xlabel(f"{_SYMBOLS[j]} [-]")
+        ax.locator_params(axis="x", nbins=5)
+        ax.use_sticky_edges = False  # the band's ends are no limits of the axis
+        ax.margins(x=0.04)
+        # How wide intervals usually are: they may be narrower than their dots.
+        half = (table.wide[1] - table.wide[0])[:, j] / (2 * table.centre[:, j])
+        half = half[np.isfinite(half)]
+        typical = f"typical 95 % interval: ± {100 * np.median(half):.2g} %" if len(half) else "no intervals"
+        ax.set_title(typical, fontsize=8)
     if labelled:
         panels[0].set_yticks(np.arange(count), labels)
         panels[0].set_ylim(count - 0.4, -0.6)
     else:
-        panels[0].set_ylim(-0.02, 1.02)
-        panels[0].set_ylabel("share of particles with a smaller value [-]")
-    alone = table.narrow is None
+        panels[0].set(ylim=(-0.02, 1.02), ylabel="share of particles with a smaller value [-]")
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=style.BLACK, marker="o", linestyle="", label="estimate" if alone else "median"),
-        *([] if alone else [Line2D([], [], color=style.BLUE, linewidth=3.2, label="50 %")]),
-        Line2D([], [], color=style.BLUE if alone else style.SKY, label="95 %"),
+        Line2D([], [], color=style.BLACK, marker="o", linestyle="", label="estimate" if single else "median"),
+        *([] if single else [Line2D([], [], color=style.BLUE, linewidth=3.2, label="50 %")]),
+        Line2D([], [], color=outer, label="95 %"),
         Line2D([], [], color=style.VERMILION, label="population median"),
         Patch(color=style.ORANGE, alpha=0.22, linewidth=0, label="95 % of the population"),
     ]
@@ -320,9 +278,8 @@ def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure,
 
 def _forest(calibration: Posterior | LeastSquares, table: CoefficientTable) -> Figure:
     names = style.particle_labels(calibration.campaign.particles)
-    labels = [names[i] for i in calibration.selection.kept]
-    figure, handles = draw_forest(table, labels)
-    title, count = "Coefficients of the particles", len(labels)
+    figure, handles = draw_forest(table, [names[i] for i in calibration.selection.kept])
+    title, count = "Coefficients of the particles", len(table.centre)
     if count > LABELLED:
         shown = f"{ROWS} of {count}" if count > ROWS else f"{count}"
         title += f", {shown} particles, each panel in its own order"
@@ -386,8 +343,7 @@ def plot_shrinkage(calibration: Posterior) -> Figure:
         ax.plot(alone[:, i], alone[:, j], markersize=2.5 if many else 4.5, zorder=3, **ring)
         ax.plot(together[:, i], together[:, j], markersize=2 if many else 3.5, zorder=4, **dot)
         ax.plot(mu[i], mu[j], markersize=11, markeredgewidth=1.8, zorder=5, **cross)
-        ax.set_xlabel(f"log {_SYMBOLS[i]} [-]")
-        ax.set_ylabel(f"log {_SYMBOLS[j]} [-]")
+        ax.set(xlabel=f"log {_SYMBOLS[i]} [-]", ylabel=f"log {_SYMBOLS[j]} [-]")
         ax.locator_params(nbins=5)
         ax.margins(0.06)
     handles: list[Line2D | Patch] = [

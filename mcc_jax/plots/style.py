@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from .. import arguments
-from .._errors import InputError
 from .._extras import extra
 from ..calibrate import LeastSquares, PaperCalibration, Posterior
-from ..campaign import Metadata
+from ..campaign import Campaign, Metadata
 
 with extra("plots"):  # every other file of the package imports this one or `curves` first
-    from matplotlib import colormaps, rc_context
+    from matplotlib import colormaps
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
     from matplotlib.figure import Figure
     from matplotlib.font_manager import findfont, get_font
+    from matplotlib.offsetbox import AnchoredText
+    from matplotlib.style import context
 
 
 CURVE_POINTS = 100  # about so many points of a curve are drawn, so that dots do not overlap
@@ -62,47 +62,29 @@ RC: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.3,
     "lines.markersize": 4.0,
-    "mathtext.default": "it",
-    "text.usetex": False,
-    "text.parse_math": True,
-    "savefig.facecolor": "white",
-    "savefig.bbox": None,
-    "figure.facecolor": "white",
 }
 type Look = dict[str, Any]
 """Keywords of what is drawn."""
 
 
-styled = rc_context(RC)
+styled = context(["default", RC])
 """Decorator: the function runs under these settings and leaves the caller's as they were."""
 
 
-@rc_context(RC)
+@styled
 def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: int = 150) -> list[Path]:
-    """Write figures as `<stem>.png` into a directory that exists.
-
-    Files of these names are overwritten; they are returned in the order of the figures. `dpi`: dots per inch.
-    """
-    folder = arguments.file_path(directory, "directory")
-    dpi = arguments.whole(dpi, "dpi", least=1)
-    if not folder.is_dir():
-        raise InputError("no such folder", file=folder, remedy="Make it first.")
-    files = []
-    for stem, figure in figures.items():
-        files.append(folder / f"{stem}.png")
-        figure.savefig(files[-1], format="png", dpi=dpi)
-    return files
+    """Write figures as `<stem>.png` into a directory that exists; the files in the order of the figures."""
+    files = {Path(directory) / f"{stem}.png": figure for stem, figure in figures.items()}
+    for file, figure in files.items():
+        figure.savefig(file, dpi=dpi)
+    return list(files)
 
 
 # ---- text from outside -----------------------------------------------------------------------------------------------
 
 
 def plain(text: str, longest: int = 24) -> str:
-    """Any text as one short line that matplotlib draws literally.
-
-    White space and characters that do not print become single blanks, characters that the font lacks the replacement
-    character, a long text loses its middle, and `$` is escaped, which would begin mathematics.
-    """
+    """Any text as one short line that matplotlib draws literally, and as well as its font can."""
     font = get_font(findfont(FONT))
     visible = "".join(c if c.isprintable() else " " for c in text)
     drawn = "".join(
@@ -115,11 +97,7 @@ def plain(text: str, longest: int = 24) -> str:
 
 
 def particle_labels(names: Sequence[str], longest: int = 24) -> list[str]:
-    """Names of particles for a figure, all different.
-
-    A bare number becomes "particle 7"; where two look the same, or part cannot be drawn, the position in the campaign
-    is added.
-    """
+    """Names of particles for a figure, all different: with their position in the campaign where two look the same."""
     labels = [f"particle {name}" if name.isdecimal() and len(name) < 8 else plain(name, longest) for name in names]
     repeated = {label for label in labels if labels.count(label) > 1} if len(set(labels)) < len(labels) else set()
     return [
@@ -135,27 +113,7 @@ def is_simulated(metadata: Metadata) -> bool:
     return "simulation" in metadata.other or "not a measurement" in (metadata.provenance or "")
 
 
-def wrapped(text: str, figure: Figure) -> list[str]:
-    """A warning as lines below the title of a figure; none for an empty one."""
-    return textwrap.wrap(text[:1].upper() + text[1:], int(figure.get_size_inches()[0] * 14))
-
-
-def cautions(figure: Figure, calibration: Posterior | LeastSquares) -> list[str]:
-    """Lines below the title that say why the numbers must not be relied on; none if they may be."""
-    if isinstance(calibration, Posterior):
-        reasons = calibration.failures()
-    else:
-        reasons = [calibration.reason] if calibration.reason else []
-        reasons += [f"the data leave this combination open: {text}" for text in calibration.identifiability.open]
-    if not reasons:
-        return []
-    further = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
-    return wrapped(f"{'' if calibration.converged else 'not converged: '}{plain(reasons[0], 300)}{further}", figure)
-
-
 # ---- layout ----------------------------------------------------------------------------------------------------------
-
-_NOTE_IN, _LEGEND_IN, _TITLE_IN, _LINE_IN = 0.2, 0.3, 0.3, 0.19
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -163,35 +121,55 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+def grid(
+    count: int,
+    columns: int,
+    size_in: tuple[float, float],
+    *,
+    xlabels: Sequence[str],
+    ylabel: str,
+    widths: Sequence[float] = (1.0,),
+) -> tuple[Figure, np.ndarray]:
+    """A figure of `count` panels in rows of at most `columns`, and its axes, of shape (count, axes of a panel).
+
+    A panel of size `size_in` is made of axes side by side with these relative widths; one or two panels are larger.
+    Labels are at the bottom and at the left only.
+    """
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    scale = 1.5 if count < 3 else 1.0
+    width, height = (scale * side for side in size_in)
+    figure = new_figure(max(width * columns, 6.4), max(height * rows + 1.0, 3.4))
+    axes = figure.subplots(rows, columns * len(widths), squeeze=False, width_ratios=[*widths] * columns)
+    panels = axes.reshape(-1, len(widths))
+    for ax in panels[count:].flat:
+        ax.set_axis_off()
+    for panel in panels[max(count - columns, 0) : count]:
+        for ax, label in zip(panel, xlabels, strict=True):
+            ax.set_xlabel(label)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(ylabel)
+    figure.align_ylabels(axes[:, 0].tolist())
+    return figure, panels[:count]
+
+
 def finish(
     figure: Figure,
-    metadata: Metadata,
+    campaign: Campaign,
     *,
     title: str = "",
-    lines: Sequence[str] = (),
+    warnings: Sequence[str] = (),
     handles: Sequence[Artist] = (),
 ) -> Figure:
-    """Add a title, lines of warnings below it, a legend below the panels and, for simulated data, a note."""
-    width, height = figure.get_size_inches()
-    below = above = 0.0
-    if is_simulated(metadata):
-        figure.text(
-            1 - 0.06 / width, 0.05 / height, "simulated data", ha="right", va="bottom", fontsize=SMALL, color=GREY
-        )
-        below += _NOTE_IN
+    """Add a title with warnings below it, a legend below the panels and, for simulated data, a note."""
+    width = int(figure.get_size_inches()[0] * 13)
+    lines = [line for text in warnings for line in textwrap.wrap(text[:1].upper() + plain(text[1:], 400), width)]
+    colour = VERMILION if lines else BLACK
+    figure.suptitle("\n".join([title, *lines]) or " ", x=0.01, ha="left", fontsize=10.0, color=colour)
+    if is_simulated(campaign.metadata):
+        figure.text(0.99, 0.995, "simulated data", ha="right", va="top", fontsize=SMALL, color=GREY)
     if handles:
-        figure.legend(
-            handles=list(handles), loc="lower center", bbox_to_anchor=(0.5, below / height), ncols=len(handles),
-            borderaxespad=0.2,
-        )  # fmt: skip
-        below += _LEGEND_IN
-    if title:
-        figure.text(0.08 / width, 1 - 0.07 / height, title, ha="left", va="top", fontsize=10.5)
-        above += _TITLE_IN
-    for line in lines:
-        figure.text(0.08 / width, 1 - (above + 0.02) / height, line, ha="left", va="top", fontsize=8.5, color=VERMILION)
-        above += _LINE_IN
-    figure.set_layout_engine("constrained", rect=(0, below / height, 1, 1 - (below + above) / height))
+        figure.legend(handles=list(handles), loc="outside lower center", ncols=len(handles), columnspacing=1.5)
     for ax in figure.axes:
         # Ticks are made when drawn, by then under the caller's settings.
         ax.tick_params(labelsize=RC["xtick.labelsize"], width=0.7, length=3)
@@ -201,20 +179,26 @@ def finish(
 def finish_joint(
     figure: Figure, calibration: Posterior | LeastSquares, title: str, handles: Sequence[Artist] = ()
 ) -> Figure:
-    """`finish` for a joint calibration, with what keeps its numbers from being relied on below the title."""
-    lines = cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    """`finish` for a joint calibration, with the first reason not to rely on its numbers below the title."""
+    if isinstance(calibration, Posterior):
+        reasons = calibration.failures()
+    else:
+        reasons = [calibration.reason] if calibration.reason else []
+        reasons += [f"the data leave this combination open: {text}" for text in calibration.identifiability.open]
+    warnings = []
+    if reasons:
+        further = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+        warnings = [f"{'' if calibration.converged else 'not converged: '}{reasons[0]}{further}"]
+    return finish(figure, calibration.campaign, title=title, warnings=warnings, handles=handles)
 
 
 def note(ax: Axes, text: str, *, place: str = "upper left") -> None:
     """A few small words in a corner of a panel."""
-    vertical, horizontal = place.split()
-    x, y = {"left": 0.025, "right": 0.975}[horizontal], {"upper": 0.975, "lower": 0.03}[vertical]
-    ax.text(
-        x, y, text, transform=ax.transAxes, ha=horizontal, va="top" if vertical == "upper" else "bottom",
-        fontsize=SMALL, linespacing=1.35, zorder=10,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
-    )  # fmt: skip
+    words: Look = {"fontsize": SMALL, "linespacing": 1.35}
+    box = AnchoredText(text, loc=place, prop=words, pad=0.2, borderpad=0.3)
+    box.patch.set(facecolor="white", edgecolor="none", alpha=0.75)
+    box.set_zorder(10)
+    ax.add_artist(box)
 
 
 def empty(ax: Axes, text: str) -> None:

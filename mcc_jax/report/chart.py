@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -25,12 +26,8 @@ LOOKS = {
 """Marker, colour (Okabe and Ito) and word of every kind of segment: never distinguished by colour alone."""
 
 COLUMNS = ("displacement", "force", "residual", "marker", "colour", "alpha", "particle", "segment", "time", "compared")
-
-
 LOADED_FROM = re.compile(r"https://(?:cdn\.jsdelivr\.net|maps\.googleapis\.com)/[^\"'`\\\s]*")
 """What Bokeh's script would load from elsewhere: MathJax, icons and maps, none of which the page uses."""
-
-
 POINTS = 40_000  # about so many in all, shared among the particles: they make a page of 3 MB that still scrolls
 FEWEST = 40  # of one particle, at least; of more particles than that allows, those that the law misses by most
 
@@ -43,20 +40,19 @@ def compare(results: Results) -> list[FittedCurve]:
         curves = () if results.campaign is None else measured_curves(results.campaign)
     if not curves:
         return []
-    rms = np.array([one.rms_um or 0.0 for one in curves])
-    chosen = np.sort(np.argsort(-rms, kind="stable")[: POINTS // FEWEST])
+    worst_first = np.argsort([-(one.rms_um or 0.0) for one in curves], kind="stable")
+    chosen = np.sort(worst_first[: POINTS // FEWEST])
     most = max(POINTS // len(chosen), FEWEST)
     return [_thinned(curves[i], most) for i in chosen]
 
 
 def _thinned(one: FittedCurve, most: int) -> FittedCurve:
     """At most about so many points; the ends of segments always."""
-    n = len(one.kind)
-    stride = -(-n // most)
-    if stride <= 1:
+    count = len(one.kind)
+    if count <= most:
         return one
     turns = np.flatnonzero(np.diff(one.kind)) + 1
-    rows = np.unique(np.concatenate([np.arange(0, n, stride), turns, turns - 1, [n - 1]]))
+    rows = np.unique(np.concatenate([np.arange(0, count, -(-count // most)), turns, turns - 1, [count - 1]]))
     columns = [f.name for f in fields(one) if f.name not in ("name", "why_not")]
     return replace(one, **{name: getattr(one, name)[rows] for name in columns})
 
@@ -87,14 +83,16 @@ def chart_items() -> dict[str, Any]:
     # Pale and broad, not dashed: where a test goes back on its own path dashes fill each other's gaps.
     curve.line("typical", "force", source=lines, color=GREY, line_alpha=0.55, line_width=2.6)
     curve.line("own", "force", source=lines, color=BLACK, line_width=1.3)
-    tips = [("particle", "@particle"), ("segment", "@segment"), ("force", "@force{0.000} mN")]
-    tips += [("displacement", "@displacement{0.000} µm"), ("test − law", "@residual{0.0000} µm")]
-    tips += [("time", "@time{0.0} s"), ("compared", "@compared")]
+    tips = {"particle": "@particle", "segment": "@segment", "force": "@force{0.000} mN"}
+    tips |= {"displacement": "@displacement{0.000} µm", "test − law": "@residual{0.0000} µm"}
+    tips |= {"time": "@time{0.0} s", "compared": "@compared"}
     for figure, x, y in ((curve, "displacement", "force"), (residual, "time", "residual")):
         marks = figure.scatter(
             x, y, source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
         )
-        figure.add_tools(HoverTool(tooltips=tips, renderers=[marks], limit=1, description="Values of a point"))
+        figure.add_tools(
+            HoverTool(tooltips=list(tips.items()), renderers=[marks], limit=1, description="Values of a point")
+        )
     document = Document()
     for root in (curve, residual):
         document.add_root(root)
@@ -141,21 +139,18 @@ def _figure(name: str, across: str, up: str) -> Any:
 def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict[str, Any]:
     """What the script shows: every particle's columns, and how kinds of segments look."""
     return {
-        "kinds": [
-            {"marker": marker, "colour": colour, "word": word}
-            for marker, colour, word in (LOOKS[kind] for kind in KINDS)
-        ],
+        "kinds": [dict(zip(("marker", "colour", "word"), LOOKS[kind], strict=True)) for kind in KINDS],
         "particles": [
             {
                 "label": label,
                 "facts": fact,
-                "time": _short(one.time_s),
-                "force": _short(one.force_mN),
-                "displacement": _short(one.displacement_um, one.own_um, one.displacement_um),
-                "own": _short(one.own_um, one.own_um, one.displacement_um),
-                "typical": _short(one.typical_um),
-                "low": _short(one.low_um, one.own_um, one.displacement_um),
-                "high": _short(one.high_um, one.own_um, one.displacement_um),
+                "time": _rounded(one.time_s, 4),
+                "force": _rounded(one.force_mN, 5),
+                "displacement": _rounded(one.displacement_um, 6),
+                "own": _rounded(one.own_um, 6),
+                "typical": _rounded(one.typical_um, 4),
+                "low": _rounded(one.low_um, 6),
+                "high": _rounded(one.high_um, 6),
                 "kind": one.kind.tolist(),
                 "used": one.used.astype(int).tolist(),
             }
@@ -164,15 +159,8 @@ def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) ->
     }
 
 
-def _short(values: np.ndarray, *others: np.ndarray) -> list[float | None] | None:
-    """The values with five digits of their range, or of what is left between two columns; None if there are none."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
+def _rounded(values: np.ndarray, decimals: int) -> list[float | None] | None:
+    """What JSON can hold of a column; None if there is nothing."""
+    if not np.isfinite(values).any():
         return None
-    reach = float(np.ptp(finite)) or float(np.abs(finite).max()) or 1.0
-    if others:
-        away = np.abs(others[0] - others[1])
-        away = away[np.isfinite(away) & (away > 0)]
-        reach = min(reach, float(np.median(away)) * 30) if len(away) else reach
-    digits = int(np.clip(5 - np.floor(np.log10(reach)), 0, 12))
-    return [round(v, digits) if np.isfinite(v) else None for v in values.tolist()]
+    return [value if math.isfinite(value) else None for value in np.round(values, decimals).tolist()]

@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from .. import arguments
 from .._extras import extra, own_version
 from .._format import interval, listed, number, percent, plain, probability, with_sd
 from .._types import Progress
@@ -22,20 +21,24 @@ from .read import Results
 
 with extra("report"):
     from ..plots.style import particle_labels
-    from . import pictures as pictures
     from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
-    from .checks import check_results, share_inside, tested
-    from .sentences import (
+    from .checks import Check, check_results, share_inside, tested
+    from .story import data_uri, example_of, example_pictures, tiles, verdict_of
+    from .texts import (
         METHODS,
-        beside_the_law,
         calibration_sentences,
+        changes,
+        equation,
         is_law_alone,
+        law_of,
+        measured,
         next_steps,
+        particle_facts,
+        particle_rows,
         quantity,
         simulated,
+        spread,
     )
-    from .story import story
-    from .tables import changes, equation, measured, particle_facts, particle_rows, spread
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -69,16 +72,20 @@ WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=
 """Blanks at which a line must not break: before a unit, and around the sign of a standard deviation or a power."""
 
 
-def report_page(results: Results, *, seed: int = 0, progress: Progress | None = None) -> str:
+def report_page(results: Results, *, progress: Progress | None = None) -> str:
     """One self-contained HTML page of what `read_results` gives; equal input, equal page.
 
-    The seed is for the record: nothing here is random. `progress` is called with the name of each step.
+    `progress` is called with the name of each step.
 
     Raises:
         RuntimeError: in single precision.
     """
-    seed = arguments.seed(seed)
-    _require_double()
+    import jax
+
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            'the report needs double precision; call jax.config.update("jax_enable_x64", True) before anything else'
+        )
     with extra("report"):
         import bokeh  # noqa: F401
         import jinja2  # noqa: F401
@@ -87,16 +94,7 @@ def report_page(results: Results, *, seed: int = 0, progress: Progress | None = 
     results = results.with_discovery
     shown = compare(results)
     progress("drawing the page")
-    return _environment().get_template("page.html").render(context(results, shown), seed=seed)
-
-
-def _require_double() -> None:
-    import jax
-
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            'the report needs double precision; call jax.config.update("jax_enable_x64", True) before anything else'
-        )
+    return _environment().get_template("page.html").render(context(results, shown))
 
 
 @cache
@@ -115,19 +113,8 @@ def _environment() -> Any:
     # Bokeh wants a model before what refers to it.
     found.policies["json.dumps_kwargs"] = {"sort_keys": False, "allow_nan": False, "separators": (",", ":")}
     found.globals |= {"plain_name": quantity, "exp": math.exp}
-    found.filters |= {
-        "number": number,
-        "percent": percent,
-        "probability": probability,
-        "with_sd": with_sd,
-        "interval": interval,
-        "plain": plain,
-        "verdict": verdict_in_words,
-        "listed": listed,
-        "exponential": exponential,
-        "spread": spread,
-        "equation": equation,
-    }
+    filters = (number, percent, probability, with_sd, interval, plain, listed, exponential, spread, equation)
+    found.filters |= {one.__name__: one for one in filters} | {"verdict": verdict_in_words}
     return found
 
 
@@ -142,15 +129,19 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
 
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
-    checks = check_results(results, shown)
+    checks, law = check_results(results, shown), law_of(results)
+    example = example_of(results, shown)
     return {
         "results": results,
         "version": own_version(),
         "simulated": simulated(results),
         "sections": _sections(results, shown, checks),
-        "story": story(results, shown),
-        "cards": _cards(results, checks),
-        "summary": _summary(results),
+        "verdict": verdict_of(results),
+        "pictures": [] if example is None else example_pictures(example),
+        "caption": "" if example is None else example.caption,
+        "tiles": [] if results.discovery is None else tiles(results.discovery),
+        "cards": _cards(results, checks, law),
+        "summary": [] if results.calibration is None else calibration_sentences(results.calibration, law),
         # A command is copied: its blanks stay as they are.
         "next_steps": [(text, escape(command)) for text, command in next_steps(results, folder)],
         "facts": [] if results.campaign is None else measured(results.campaign),
@@ -172,7 +163,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
-        "law": f"the law{beside_the_law(results)}",
+        "law": law,
         "law_alone": is_law_alone(results),
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
@@ -189,54 +180,34 @@ def _closed(script: str) -> str:
     return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
 
 
-def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
+def _cards(results: Results, checks: list[Check], law: str) -> list[dict[str, str]]:
     """The answers at the top, each with a level, a heading and a line."""
-    found = []
-    if results.calibration is not None:
-        content, alone = results.calibration, is_law_alone(results)
-        used = sum(entry["kept"] for entry in content["particles"])
-        law = f" of the law{beside}" if (beside := beside_the_law(results)) else ""
-        done, trusted = content["converged"], worst(tested(results)) != "error"
-        found.append(
-            {
-                "level": "good" if done and trusted else "bad",
-                "title": f"Calibration{law}",
-                "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
-                "line": f"{used} of {len(content['particles'])} particles, by {METHODS[content['method']]}",
-            }
-        )
-        good, look, bad = ([f"“{c.check}”" for c in checks if c.level == one] for one in ("good", "look", "bad"))
-        found.append(
-            {
-                "level": "bad" if bad else "look" if look else "good",
-                "title": f"Checks{law}",
-                "answer": _count(len(checks) - len(good), len(checks)) if trusted else "Numbers cannot be true",
-                "line": _not_fine([*bad, *look], alone),
-            }
-        )
-    return found
-
-
-def _count(failed: int, checks: int) -> str:
-    """How many checks are not fine."""
-    return f"{failed} of {checks} fail" if failed else f"all {checks} hold"
-
-
-def _not_fine(names: list[str], alone: bool) -> str:
-    """Which checks failed; that some must fail where the law alone lacks what was found."""
-    if not names:
-        return "nothing is conspicuous"
-    return listed(names) + (": to be expected, since it lacks what was found" if alone else "")
-
-
-def _summary(results: Results) -> list[str]:
-    """What is below the first screen, in sentences."""
-    if results.calibration is None:
+    content = results.calibration
+    if content is None:
         return []
-    return calibration_sentences(results.calibration, beside_the_law(results), alone=is_law_alone(results))
+    used, of = sum(entry["kept"] for entry in content["particles"]), "" if law == "the law" else f" of {law}"
+    done, trusted = content["converged"], worst(tested(results)) != "error"
+    good, look, bad = ([f"“{c.check}”" for c in checks if c.level == one] for one in ("good", "look", "bad"))
+    failed, conspicuous = len(checks) - len(good), listed([*bad, *look]) if bad or look else "nothing is conspicuous"
+    count = f"{failed} of {len(checks)} fail" if failed else f"all {len(checks)} hold"
+    expected = ": to be expected, since it lacks what was found" if (bad or look) and is_law_alone(results) else ""
+    return [
+        {
+            "level": "good" if done and trusted else "bad",
+            "title": f"Calibration{of}",
+            "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
+            "line": f"{used} of {len(content['particles'])} particles, by {METHODS[content['method']]}",
+        },
+        {
+            "level": "bad" if bad else "look" if look else "good",
+            "title": f"Checks{of}",
+            "answer": count if trusted else "Numbers cannot be true",
+            "line": conspicuous + expected,
+        },
+    ]
 
 
-def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> list[tuple[str, str]]:
+def _sections(results: Results, shown: list[FittedCurve], checks: list[Check]) -> list[tuple[str, str]]:
     """Name and title of every section that has something to show: particles, parameters, checks, details."""
     calibrated = results.calibration is not None
     there = (
@@ -262,7 +233,7 @@ def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:
         section, caption = CAPTIONS.get(_kind(stem), ("posterior", stem.replace("_", " ")))
         if section in ("law", "compare", "posterior") and results.has_found != stem.startswith("discovery"):
             section = "alone" if results.has_found else "discovery"
-        found[section].append((pictures.data_uri(results.figures[stem]), caption))
+        found[section].append((data_uri(results.figures[stem]), caption))
     return found
 
 

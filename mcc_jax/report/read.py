@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import re
 from collections.abc import Iterator, Mapping
@@ -58,17 +59,14 @@ class Results:
 
     Attributes:
         name: of the folder.
-        campaign: the tests.
-        checksums: of their files, SHA-256 by name.
-        calibration: contents of `calibration.json`.
-        discovery: contents of `discovery.json`.
+        campaign, checksums: the tests, and the SHA-256 of their files by name.
+        calibration, discovery: contents of `calibration.json` and `discovery.json`.
+        saved, found: the calibration and the discovery themselves.
         provenance: how the two came about, by the names of these files.
-        saved: the calibration itself, as `mcc_jax.load` gives it.
         figures: files of `figures/` that the two results name as theirs, by stem.
         written: the day of the newest result.
         cautions: where parts contradict each other.
         missing_campaign: why there is no campaign, if there is none.
-        found: the discovery itself.
     """
 
     name: str
@@ -97,18 +95,17 @@ class Results:
 
         None, too, where the calibration is of a law with effects itself, or there is none to compare it with.
         """
-        found, campaign = self.found, self.campaign
-        if self.calibration is None or self.calibration.get("effects"):
+        posterior = None if self.found is None else self.found.posterior
+        if posterior is None or self.campaign is None or self.calibration is None or self.calibration.get("effects"):
             return None
-        if found is None or campaign is None or found.posterior is None or found.posterior.failures():
-            return None
-        return found.posterior if found.posterior.campaign.particles == campaign.particles else None
+        same = posterior.campaign.particles == self.campaign.particles
+        return posterior if same and not posterior.failures() else None
 
     @property
     def with_discovery(self) -> Results:
         """What a page shows: of the law with what discovery added where that may be believed, else as it is."""
-        posterior, found = self.with_found, self.discovery
-        if posterior is None or found is None:
+        posterior = self.with_found
+        if posterior is None:
             return self
         provenance = {**self.provenance, CALIBRATION: self.provenance[DISCOVERY]}
         return replace(self, calibration=posterior.to_json(), provenance=provenance, saved=posterior)
@@ -139,43 +136,46 @@ class Results:
 def read_results(folder: str | Path, campaign: str | Path | None = None, *, name: str | None = None) -> Results:
     """Read what a folder holds of a campaign, a calibration, its posterior and a discovery.
 
-    The campaign is looked for in the folder itself, in its subfolder `campaign`, and where calibration or discovery
-    found it.
-
     Args:
         folder: the folder of results.
-        campaign: the folder of the campaign, if it is elsewhere.
+        campaign: the folder of the campaign; looked for in the folder itself, in its subfolder `campaign`, and where
+            calibration or discovery found it, if None.
         name: what to call the folder.
 
     Raises:
         InputError: if a file is damaged or there is nothing to report.
     """
-    path = arguments.file_path(folder, "folder")
-    if campaign is not None:
-        campaign = arguments.file_path(campaign, "campaign")
-    there = _listed(path)
-    saved = {name: read_saved(path / archive) for name, archive in ARCHIVES.items() if archive in there}
-    contents = {name: result.to_json() for name, result in saved.items()}
-    cautions, written = [], {}
-    for name, content in contents.items():
-        written[name] = _written(path / name) if name in there else Written()
-        if name in there and written[name].runtime_s != content["runtime_s"]:
-            cautions.append(f"{name} is not of the {ARCHIVES[name]} next to it, and is left out")
-            written[name] = Written()
-    for name in (name for name in ARCHIVES if name in there and name not in saved):
-        raise InputError(f"{ARCHIVES[name]} is missing next to {name}", file=path, remedy="Calibrate or discover again")
-    provenance = {name: one.provenance for name, one in written.items()}
-    where, why = _find(path, there, campaign, provenance)
+    path, again = arguments.file_path(folder, "folder"), "Calibrate or discover again"
+    try:
+        there = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
+    except OSError as error:
+        remedy = "Give a folder that mcc-jax demo, calibrate or discover wrote into"
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path, remedy=remedy) from None
+    for file, archive in ARCHIVES.items():
+        if file in there and archive not in there:
+            raise InputError(f"{archive} is missing next to {file}", file=path, remedy=again)
+    saved = {file: read_saved(path / archive) for file, archive in ARCHIVES.items() if archive in there}
+    contents = {file: result.to_json() for file, result in saved.items()}
+    cautions, written = [], {file: Written() for file in saved}
+    for file in sorted(there & set(saved)):
+        try:
+            found = msgspec.json.decode(read_regular(path / file, RESULT_BYTES, again), type=Written)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise InputError(f"is damaged: {error}", file=path / file, remedy=again) from None
+        if found.runtime_s == contents[file]["runtime_s"]:
+            written[file] = found
+        else:
+            cautions.append(f"{file} is not of the {ARCHIVES[file]} next to it, and is left out")
+    provenance = {file: one.provenance for file, one in written.items()}
+    where, why = (Path(campaign), "") if campaign is not None else _find(path, there, provenance)
     data = None if where is None else check_tests(read_campaign(where))
     checksums = {} if where is None else file_checksums(where)
     if data is None and not saved:
-        found = ", ".join(sorted(there)[:8]) or "nothing"
-        raise InputError(
-            "there is nothing to report",
-            file=path,
-            remedy=f"Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: {found}",
-        )
+        remedy = "Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: "
+        remedy += ", ".join(sorted(there)[:8]) or "nothing"
+        raise InputError("there is nothing to report", file=path, remedy=remedy)
     calibration = saved.get(CALIBRATION)
+    days = (datetime.date.fromtimestamp((path / ARCHIVES[file]).stat().st_mtime) for file in saved)
     return Results(
         name or path.resolve().name or str(path),
         calibration.campaign if data is None and calibration is not None else data,
@@ -185,51 +185,24 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
         provenance,
         calibration,
         _figures(path, [name for one in written.values() for name in one.figures]),
-        max((datetime.date.fromtimestamp((path / ARCHIVES[name]).stat().st_mtime) for name in saved), default=None),
+        max(days, default=None),
         (*cautions, *_cautions(data, checksums, provenance, contents.get(CALIBRATION))),
         why,
         saved.get(DISCOVERY),
     )
 
 
-def _written(file: Path) -> Written:
-    """What the JSON of a result says of its making. Raises `InputError` if it is damaged."""
-    remedy = "Calibrate or discover again"
-    try:
-        return msgspec.json.decode(read_regular(file, RESULT_BYTES, remedy), type=Written)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"is damaged: {error}", file=file, remedy=remedy) from None
-
-
-def _listed(path: Path) -> set[str]:
-    try:
-        return {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
-    except FileNotFoundError:
-        problem, remedy = "there is no such folder", "Give a folder of results; mcc-jax demo makes one"
-    except NotADirectoryError:
-        problem, remedy = "is a file, not a folder of results", "Give the folder that calibrate wrote into"
-    except OSError as error:
-        problem, remedy = f"cannot be read: {error.strerror or error}", "Check the permissions"
-    raise InputError(problem, file=path, remedy=remedy)
-
-
-def _find(
-    path: Path, there: set[str], given: str | Path | None, provenance: Mapping[str, Provenance]
-) -> tuple[Path | None, str]:
+def _find(path: Path, there: set[str], provenance: Mapping[str, Provenance]) -> tuple[Path | None, str]:
     """The campaign's folder, or why there is none."""
-    if given is not None:
-        return Path(given), ""
     if there & set(DATA):
         return path, ""
     if CAMPAIGN in there:
         return path / CAMPAIGN, ""
-    recorded = [one.campaign.folder for one in provenance.values() if one.campaign is not None]
+    recorded = [path / one.campaign.folder for one in provenance.values() if one.campaign is not None]
     for folder in recorded:
-        try:
-            if all((path / folder / name).is_file() for name in DATA):
-                return path / folder, ""
-        except (OSError, ValueError):  # a text that is no path
-            continue
+        with contextlib.suppress(OSError, ValueError):  # a text that is no path
+            if all((folder / name).is_file() for name in DATA):
+                return folder, ""
     if recorded:
         return None, "The campaign's folder is no longer where the results found it."
     return None, "The results do not say where their campaign is."
@@ -241,7 +214,7 @@ def _cautions(
     provenance: Mapping[str, Provenance],
     calibration: dict[str, Any] | None,
 ) -> Iterator[str]:
-    recorded = {name: {} if one.campaign is None else one.campaign.sha256 for name, one in provenance.items()}
+    recorded = {name: one.campaign.sha256 for name, one in provenance.items() if one.campaign is not None}
     for name, sums in recorded.items():
         changed = [f for f in DATA if f in sums and f in checksums and sums[f] != checksums[f]]
         if changed:
@@ -251,22 +224,18 @@ def _cautions(
         if any(one.get(f) != other.get(f) for f in DATA):
             yield f"{CALIBRATION} and {DISCOVERY} were made from different data"
     if data is not None and calibration is not None:
-        names = [entry["particle"] for entry in calibration["particles"]]
-        missing = [name for name in names if name not in data.particles]
+        missing = [name for entry in calibration["particles"] if (name := entry["particle"]) not in data.particles]
         if missing:
             yield f"{len(missing)} particles of {CALIBRATION} are not in the campaign, {missing[0]!r} first"
 
 
 def _figures(path: Path, names: list[str]) -> dict[str, bytes]:
+    """Pictures by stem; the page does without those that cannot be read."""
     found = {}
     for name in names:
         match = FIGURE.fullmatch(name)
-        try:
-            if match is None or not (path / name).exists():
-                continue
-            picture = read_regular(path / name, LARGEST_FIGURE, "")
-        except (OSError, InputError):  # the page does without it
-            continue
-        if picture.startswith(PNG):
-            found[match[1]] = picture
+        with contextlib.suppress(OSError, InputError):
+            picture = read_regular(path / name, LARGEST_FIGURE, "") if match else b""
+            if match and picture.startswith(PNG):
+                found[match[1]] = picture
     return found

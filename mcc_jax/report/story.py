@@ -1,60 +1,85 @@
-"""The first screen: what was found in one sentence, the test that shows it best, and the numbers that matter."""
+"""The first screen: what was found in one sentence, the test that shows it best as two pictures, and what matters."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import io
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.style import context
+from matplotlib.transforms import ScaledTranslation
 
 from .._format import listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import FittedCurve
 from ..discovery import Discovery
 from ..discovery.sentences import headline
-from ..plots.style import is_simulated
-from .pictures import Example, example_pictures
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, VERMILION, Look, is_simulated, new_figure
 from .read import Results
-from .sentences import quantity, simulated
+from .texts import quantity, simulated
+
+FEWEST = 12
+"""Least number of readings in the enlarged part of a test that has them."""
 
 
 @dataclass(frozen=True)
-class Story:
-    """The top of the page.
+class Example:
+    """The test that shows best what was found: measured, measured less predicted by each law, noise, and in words."""
 
-    Attributes:
-        verdict: the answer in one sentence.
-        pictures: of the most telling particle: source, and in words what it shows.
-        caption: what all of them show.
-        tiles: a heading, an answer and a line of meaning each.
-    """
-
-    verdict: str
-    pictures: list[tuple[str, str]]
+    time_s: np.ndarray
+    force_mN: np.ndarray
+    displacement_um: np.ndarray
+    before_um: np.ndarray
     caption: str
-    tiles: list[tuple[str, str, str]]
+    after_um: np.ndarray | None = None  # by the law with what was added to it, which is called `added`
+    noise_um: np.ndarray | None = None
+    added: str = ""
+    simulated: bool = False
+
+    @property
+    def laws(self) -> list[tuple[np.ndarray, Look]]:
+        """Measured less predicted, and how it is drawn and called, of every law: broad and pale below narrow and dark.
+
+        Dashes would not do: where a test goes back on its own path they fill each other's gaps.
+        """
+        if self.after_um is None:
+            return [(self.before_um, {"color": VERMILION, "linewidth": 1.4, "label": "law"})]
+        alone: Look = {"color": VERMILION, "alpha": 0.6, "linewidth": 2.8, "label": "law alone"}
+        return [(self.before_um, alone), (self.after_um, {"color": BLUE, "linewidth": 1.4, "label": self.added})]
+
+    @property
+    def near(self) -> np.ndarray:
+        """Which readings are in the enlarged part: a strip of displacement, where law and test differ most in all."""
+        gap = np.abs(self.before_um - (0.0 if self.after_um is None else self.after_um))
+        width = max(10 * float(np.quantile(gap, 0.9)), 0.03 * float(np.ptp(self.displacement_um)))
+        left = self.displacement_um[:, None]
+        while True:
+            inside = (self.displacement_um >= left) & (self.displacement_um <= left + width)
+            found = inside[int(np.argmax(inside @ gap**2))]
+            if found.sum() >= FEWEST or not width < np.ptp(self.displacement_um):
+                return found
+            width *= 1.5
 
 
-def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
-    """The first screen of what a folder holds."""
-    found = results.discovery
-    if found is not None:
-        example = most_informative_test(results.found) if results.found is not None else None
-        example = example or _of_fit(shown)
-        tests = "simulated tests" if simulated(results) else "tests"
-        return Story(headline(found, tests), *_drawn(example), _gap_tiles(found))
-    if results.calibration is not None:
-        content = results.calibration
-        used = sum(entry["kept"] for entry in content["particles"])
-        state = f"The law was calibrated on {used} of {len(content['particles'])} particles"
-        verdict = f"{state}." if content["converged"] else f"{state}; the calibration did not converge."
-        return Story(verdict, *_drawn(_of_fit(shown)), [])
-    count = 0 if results.campaign is None else len(results.campaign)
-    return Story(f"{count} particles were measured; nothing has been calibrated on them yet.", [], "", [])
+# ---- which test ------------------------------------------------------------------------------------------------------
 
 
-def _drawn(example: Example | None) -> tuple[list[tuple[str, str]], str]:
-    return ([], "") if example is None else (example_pictures(example), example.caption)
+def example_of(results: Results, shown: Sequence[FittedCurve]) -> Example | None:
+    """The test to show: of a discovery the one whose gap closes most, else the one that the law fits worst."""
+    example = None if results.found is None else most_informative_test(results.found)
+    known = [one for one in shown if one.rms_um is not None]
+    if example is not None or not known:
+        return example
+    one = max(known, key=lambda one: one.rms_um or 0.0)
+    worst = f"of all particles the one that the law misses most, by {number(one.rms_um, 2)} µm on average"
+    caption = f"Particle {one.name} with its own curve of loading: {worst}."
+    columns = (one.time_s, one.force_mN, one.displacement_um, one.displacement_um - one.own_um)
+    return Example(*(column[one.used] for column in columns), caption)
 
 
 def most_informative_test(found: Discovery) -> Example | None:
@@ -74,8 +99,8 @@ def most_informative_test(found: Discovery) -> Example | None:
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))
-    i, rows = base.selection.kept[j], base.selection.rows[j]
-    curve, used = base.campaign.curves[i], left.used[j, : len(rows)]
+    campaign, i, rows = base.campaign, base.selection.kept[j], base.selection.rows[j]
+    curve, used = campaign.curves[i], left.used[j, : len(rows)]
     rows = np.asarray(rows)[used]
     off, which = f"{number(float(rms[0][j]), 2)} µm", "fits worst"
     if added:
@@ -83,36 +108,130 @@ def most_informative_test(found: Discovery) -> Example | None:
         off += f" before and {number(float(rms[1][j]), 2)} µm after {name} was added"
         off += f" (median of all: {middle[0]} and {middle[1]})"
         which = "gains most"
-    shown = f"particle {base.campaign.particles[i]}, which of {len(before)} particles {which}"
+    shown = f"particle {campaign.particles[i]}, which of {len(before)} particles {which}"
     caption = f"Shown: {shown}. On average the law is off by {off}.{source}"
-    columns = (column[j, : len(used)][used] for column in (before, after, left.noise))
-    one, two, noise = columns
-    return Example(
-        curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows], one, two if added else None, noise,
-        f"law with {name}" if added else "", caption, is_simulated(base.campaign.metadata),
-    )  # fmt: skip
+    measured = (column[rows] for column in (curve.time_s, curve.force_mN, curve.displacement_um))
+    one, two, noise = (column[j, : len(used)][used] for column in (before, after, left.noise))
+    more = {"after_um": two, "added": f"law with {name}"} if added else {}
+    return Example(*measured, one, caption, noise_um=noise, simulated=is_simulated(campaign.metadata), **more)
 
 
-def _of_fit(shown: Sequence[FittedCurve]) -> Example | None:
-    """The calibrated test that the law misses most."""
-    known = [one for one in shown if one.rms_um is not None]
-    if not known:
-        return None
-    one = max(known, key=lambda one: one.rms_um or 0.0)
-    use = one.used
-    caption = (
-        f"Particle {one.name} with its own curve of loading: of all particles the one that the law misses most, by "
-        f"{number(one.rms_um, 2)} µm on average."
+# ---- its pictures ----------------------------------------------------------------------------------------------------
+
+
+@context(["default", RC, {"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}])  # equal pages; text stays text
+def example_pictures(example: Example) -> list[tuple[str, str]]:
+    """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
+    pictures: tuple[tuple[Callable[..., list[Any]], str, str], ...] = (
+        (
+            draw_enlarged,
+            "where law and test differ, enlarged",
+            "Force over displacement, enlarged where they differ most",
+        ),
+        (draw_left_over, "test minus law, over time", "Measured less predicted displacement over time"),
     )
-    away = one.displacement_um - one.own_um
-    return Example(
-        one.time_s[use], one.force_mN[use], one.displacement_um[use], away[use], None, None, "", caption
-    )  # fmt: skip
+    found = []
+    for draw, title, words in pictures:
+        figure = new_figure(4.6, 3.6)  # no wider than a phone, where its type is read at the size in which it is set
+        ax = figure.subplots()
+        handles = draw(ax, example)
+        ax.set_title(title, fontsize=9.5, color=BLACK, pad=4)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.6)
+        stream = io.BytesIO()
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+        found.append((data_uri(stream.getvalue(), "svg+xml"), f"{words}: {example.caption}"))
+    return found
 
 
-def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """The share of the gap that is closed, what it did to the modulus, and the amplitude."""
-    tiles = []
+def draw_enlarged(ax: Axes, example: Example) -> list[Any]:
+    """Force over displacement where law and test differ most, in a corner the whole test; entries of a legend."""
+    across, up = example.displacement_um[example.near], example.force_mN[example.near]
+    width, height = float(np.ptp(across)), float(np.ptp(up))
+    dots: Look = {"marker": "o", "linestyle": "", "color": PALE, "markeredgecolor": GREY, "markeredgewidth": 0.4}
+    inset = ax.inset_axes(_emptiest(across, up))
+    for panel, scale in ((ax, 1.0), (inset, 0.3)):
+        panel.plot(example.displacement_um, example.force_mN, markersize=4.5 * scale, **dots)
+        for away, look in example.laws:
+            line = look | {"linewidth": scale * look["linewidth"]}
+            panel.plot(example.displacement_um - away, example.force_mN, **line)
+    ax.set(xlabel="displacement [µm]", ylabel="force [mN]")
+    ax.set_xlim(across.min() - 0.05 * width, across.max() + 0.05 * width)
+    ax.set_ylim(up.min() - 0.05 * height, up.max() + 0.05 * height)
+    inset.set(xticks=[], yticks=[])
+    inset.spines[["top", "right"]].set_visible(True)
+    inset.set_title("the whole test", fontsize=8.5, color=BLACK, pad=2, loc="center")
+    frame: Look = {"fill": False, "edgecolor": BLACK, "linewidth": 1.1, "zorder": 9}
+    inset.add_patch(Rectangle((across.min(), up.min()), width, height, **frame))
+    _arrows(ax, example)
+    test = Line2D([], [], markersize=4.5, label="simulated test" if example.simulated else "measured", **dots)
+    return [test, *(Line2D([], [], **look) for _, look in example.laws)]
+
+
+def draw_left_over(ax: Axes, example: Example) -> list[Any]:
+    """What each law leaves over time, next to the noise; entries of a legend."""
+    handles: list[Any] = []
+    if example.noise_um is not None:
+        look: Look = {"color": ORANGE, "alpha": 0.45, "linewidth": 0, "label": "noise (± 1 sd)"}
+        handles.append(ax.fill_between(example.time_s, -example.noise_um, example.noise_um, **look))
+    ax.axhline(0.0, color=GREY, linewidth=0.7)
+    for away, look in example.laws:
+        handles += ax.plot(example.time_s, away, **look)
+    ax.set(xlabel="time [s]", ylabel="test − law [µm]")
+    ax.margins(x=0.01)
+    return handles
+
+
+def _arrows(ax: Axes, example: Example) -> None:
+    """Which way the test goes: an arrow next to the loading and the release that cover most force in sight."""
+    near, rising = np.flatnonzero(example.near), np.append(np.diff(example.force_mN), 0.0)[example.near] > 0
+    turns = np.flatnonzero((np.diff(near) > 1) | np.diff(rising)) + 1
+    runs = [run for run in np.split(near, turns) if len(run) > 2]
+    for up, shift in ((True, (-7, 7)), (False, (9, -5))):
+        own = [run for run in runs if (example.force_mN[run[1]] > example.force_mN[run[0]]) == up]
+        if not own:
+            continue
+        run = max(own, key=lambda r: float(np.ptp(example.force_mN[r])))
+        start, end = run[int(0.4 * (len(run) - 1))], run[int(0.7 * (len(run) - 1))]
+        offset = ax.transData + ScaledTranslation(shift[0] / 72, shift[1] / 72, ax.figure.dpi_scale_trans)
+        ends = [(example.displacement_um[k], example.force_mN[k]) for k in (end, start)]
+        look = {"arrowstyle": "-|>", "color": GREY, "linewidth": 1.0}
+        ax.annotate("", *ends, xycoords=offset, textcoords=offset, arrowprops=look)
+
+
+def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, float]:
+    """The corner of a panel in which the fewest points lie, for a small panel: left, bottom, width, height."""
+    wide, high = 0.36, 0.34
+    x, y = ((column - column.min()) / max(float(np.ptp(column)), 1e-300) for column in (across, up))
+    corners = [(left, low) for low in (0.0, 1.0 - high) for left in (0.0, 1.0 - wide)]
+    lying = [np.sum((x >= a) & (x <= a + wide) & (y >= b) & (y <= b + high)) for a, b in corners]
+    left, low = corners[int(np.argmin(lying))]
+    return 0.03 + 0.94 * left, 0.03 + 0.9 * low, 0.94 * wide, 0.9 * high
+
+
+def data_uri(picture: bytes, kind: str = "png") -> str:
+    """A picture as part of the page."""
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
+
+
+# ---- the words -------------------------------------------------------------------------------------------------------
+
+
+def verdict_of(results: Results) -> str:
+    """The answer in one sentence."""
+    if results.discovery is not None:
+        return headline(results.discovery, "simulated tests" if simulated(results) else "tests")
+    if results.calibration is not None:
+        content = results.calibration
+        used = sum(entry["kept"] for entry in content["particles"])
+        state = f"The law was calibrated on {used} of {len(content['particles'])} particles"
+        return f"{state}." if content["converged"] else f"{state}; the calibration did not converge."
+    count = 0 if results.campaign is None else len(results.campaign)
+    return f"{count} particles were measured; nothing has been calibrated on them yet."
+
+
+def tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Heading, answer and meaning: how much of the gap is closed, what that did to the modulus, and the amplitude."""
+    made = []
     gap = found["gap"]
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))
@@ -120,40 +239,35 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
             "of what the law alone missed on particles that were held out, each predicted from others: χ² "
             f"per point (misfit in units of the noise) falls from {before} to {after}; 1 is noise alone."
         )
-        tiles.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
+        made.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
     sides = found["parameters_before"], found["parameters_after"]
-    pair = [side.get("modulus_at_peaks_MPa", side.get("effective_modulus_MPa")) for side in sides]
-    if all(one is not None and one["value"] is not None for one in pair) and found["parameters_after"]:
-        before, after = pair
+    before, after = (side.get("modulus_at_peaks_MPa", side.get("effective_modulus_MPa")) or {} for side in sides)
+    if before.get("value") is not None and after.get("value") is not None:
         change = 100 * (after["value"] / before["value"] - 1)
-        way = "higher" if change > 0 else "lower"
-        meaning = (
-            f"at the peaks of these tests; {number(abs(change), 2)} % {way} than by the law alone, which gives "
-            f"{with_sd(before, 1e-3)} GPa."
-        )
-        tiles.append(("Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning))
+        way = f"{number(abs(change), 2)} % {'higher' if change > 0 else 'lower'}"
+        meaning = f"at the peaks of these tests; {way} than by the law alone, which gives {with_sd(before, 1e-3)} GPa."
+        made.append(("Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning))
     for effect in found["effects"]:
-        parameters = list(effect["parameters"].items())
-        if not parameters:
-            continue
-        (name, first), *others = parameters
-        more = "".join(f"; {quantity(other)} {with_sd(value)}" for other, value in others)
-        meaning = (
-            f"{quantity(name)}, ± one standard deviation{more}. That it is this one, of {len(found['ranking'])} "
-            f"effects that these tests could show, has probability {probability(effect['probability'])}."
-        )
-        tiles.append((plain(effect["mechanism"]).capitalize(), with_sd(first), meaning))
+        parameters = [(quantity(name), with_sd(value)) for name, value in effect["parameters"].items()]
+        if parameters:
+            (name, value), *others = parameters
+            more = "".join(f"; {other} {text}" for other, text in others)
+            meaning = (
+                f"{name}, ± one standard deviation{more}. That it is this one, of {len(found['ranking'])} effects that "
+                f"these tests could show, has probability {probability(effect['probability'])}."
+            )
+            made.append((plain(effect["mechanism"]).capitalize(), value, meaning))
     if found["verdict"] == "NO_GAP":
         chance = found.get("p_anything_missing")
-        meaning = "that tests of a law that lacks nothing disagree with it at least so much."
         if chance is not None:
-            tiles.append(("Disagreement by chance", f"probability {probability(chance)}", meaning))
-        seen = [e for e in found["ranking"] if e["detection_limit"] is not None][:3]
+            meaning = "that tests of a law that lacks nothing disagree with it at least so much."
+            made.append(("Disagreement by chance", f"probability {probability(chance)}", meaning))
+        seen = [
+            f"{plain(e['mechanism'])} from {number(e['detection_limit'], 2)} {e['unit'].replace('um', 'µm').strip('-')}"
+            for e in found["ranking"]
+            if e["detection_limit"] is not None
+        ]
         if seen:
-            names = "; ".join(
-                f"{plain(e['mechanism'])} from {number(e['detection_limit'], 2)}"
-                f"{'' if e['unit'] == '-' else ' ' + e['unit'].replace('um', 'µm')}"
-                for e in seen
-            )
-            tiles.append(("What would have shown", f"{len(found['ranking'])} effects", f"For example {names}."))
-    return tiles
+            examples = "; ".join(text.rstrip() for text in seen[:3])
+            made.append(("What would have shown", f"{len(found['ranking'])} effects", f"For example {examples}."))
+    return made

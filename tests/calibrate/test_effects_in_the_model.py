@@ -157,5 +157,5 @@ def test_least_squares_agrees_with_the_mode(campaign, posterior):
 
 
 def test_two_formulas_of_one_mechanism_are_refused():
-    with pytest.raises(mcc.InputError, match="creep stands twice"):
+    with pytest.raises(mcc.InputError, match="creep appears twice"):
         mcc.Model().with_effects(CREEP, "creep")

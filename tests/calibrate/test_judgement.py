@@ -80,7 +80,7 @@ def test_what_was_found_and_taken_off_stands_in_the_result():
 def test_a_modulus_that_no_unloading_tells_is_told_as_unknown():
     found = {one.check: one for one in calibrated("hidden").findings}
     assert set(found) == {"saturation", MODULUS_OPEN}
-    assert "displacement stands at the end of its range" in found[MODULUS_OPEN].sentence
+    assert "displacement is at the end of its range" in found[MODULUS_OPEN].sentence
     assert "larger range of displacement" in found[MODULUS_OPEN].remedy
     assert found[MODULUS_OPEN].level == "warning"
     low, high = modulus("hidden")["interval_95"]

@@ -22,7 +22,7 @@ def test_the_turning_point_that_the_force_channel_did_not_see_is_worked_out(seed
     checked = check_tests(faulty.clipped(campaign, share))
     (found,) = campaign_findings(checked)
     assert (found.check, found.level, found.particles) == ("saturation", "warning", campaign.particles)
-    assert "force stands at" in found.sentence
+    assert "force stays at" in found.sentence
     assert "larger range" in found.remedy
     for true, raw, curve in zip(exact().curves, checked.raw.curves, checked.curves, strict=True):
         kept = curve.checked
@@ -54,7 +54,7 @@ def test_a_displacement_at_the_end_of_its_range_is_not_compared(seed, share):
     checked = check_tests(faulty.clipped(campaign, share, channel="displacement"))
     (found,) = campaign_findings(checked)
     assert (found.check, found.level, found.particles) == ("saturation", "warning", campaign.particles)
-    assert "displacement stands at" in found.sentence
+    assert "displacement stays at" in found.sentence
     assert "larger range of displacement" in found.remedy
     for raw, curve in zip(checked.raw.curves, checked.curves, strict=True):
         assert np.array_equal(raw.displacement_um, curve.displacement_um)

@@ -1,9 +1,7 @@
 import shutil
 
 import pytest
-from click.testing import CliRunner
-
-from mcc_jax.cli.main import cli
+from asserting import done
 
 PARTICLES = (
     "particle,D1_um,D2_um,D3_um,batch\nA,213.54,196.07,186.33,x\nB,155.32,217.51,136.87,y\nC,97.56,100.98,69.09,y\n"
@@ -11,13 +9,11 @@ PARTICLES = (
 
 
 @pytest.fixture(scope="session")
-def simulated(tmp_path_factory):
+def simulated(run, tmp_path_factory):
     """A small campaign made by `simulate`; do not write into it."""
     folder = tmp_path_factory.mktemp("simulated")
     (folder / "three.csv").write_text(PARTICLES)
-    arguments = ["simulate", "--particles", folder / "three.csv", "--out", folder / "campaign", "--points", "60"]
-    result = CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
-    assert (result.exit_code, result.stderr) == (0, "")
+    done(run("simulate", "--particles", folder / "three.csv", "--out", folder / "campaign", "--points", "60"))
     return folder / "campaign"
 
 

@@ -4,11 +4,9 @@ import json
 import shutil
 
 import pytest
-from asserting import snapshot
-from click.testing import CliRunner
+from asserting import done, snapshot
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
-from mcc_jax.cli.main import cli
 from mcc_jax.discovery.sentences import verdict_in_words
 from mcc_jax.effects import LIBRARY
 
@@ -26,15 +24,6 @@ STEP = {"added", "chi2_per_dof", "systematic_um", "elpd", "elpd_se"}
 ESTIMATE = {"value", "sd", "interval_95"}
 HIDDEN = 0.004
 QUICK = ("--no-experiments", "--no-posterior")
-
-
-def call(*arguments):
-    return CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
-
-
-def done(result):
-    assert (result.exit_code, result.stderr) == (0, ""), (result.stdout, result.stderr, result.exception)
-    return result.stdout
 
 
 def check_contract(content):
@@ -64,23 +53,23 @@ def check_contract(content):
 
 
 @pytest.fixture(scope="module")
-def tests(tmp_path_factory):
+def tests(run, tmp_path_factory):
     """Ten particles of the paper's sizes: with a compliant frame, and as the law says."""
     folder = tmp_path_factory.mktemp("tests")
     rows = (f"{i},{D1},{D2},{D3}" for i, (D1, D2, D3) in enumerate(PAPER_DIAMETERS_UM[:10], 1))
     (folder / "ten.csv").write_text("\n".join(["particle,D1_um,D2_um,D3_um", *rows, ""]))
     base = ["simulate", "--particles", folder / "ten.csv", "--points", "150", "--noise-um", "0.02", "--seed", "3"]
     base += ["--levels", "0.5,1,1", "--unload-to", "0.3", "--hold-s", "30", "--peak-stress", "8:14"]
-    done(call(*base, "--out", folder / "null"))
-    done(call(*base, "--out", folder / "frame", "--effect", f"frame_compliance={HIDDEN}"))
+    done(run(*base, "--out", folder / "null"))
+    done(run(*base, "--out", folder / "frame", "--effect", f"frame_compliance={HIDDEN}"))
     return folder
 
 
 @pytest.fixture(scope="module")
-def found(tests, tmp_path_factory):
+def found(run, tests, tmp_path_factory):
     """What the command finds in the tests with the frame: its words, and where its files are."""
     out = tmp_path_factory.mktemp("found") / "new"
-    return done(call("discover", tests / "frame", "--out", out, *QUICK)), out
+    return done(run("discover", tests / "frame", "--out", out, *QUICK)), out
 
 
 def test_the_frame_is_found_and_its_size(found):
@@ -117,12 +106,12 @@ def test_the_command_says_what_it_found(found):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
+def test_same_seed_same_file_and_stale_figures_go(run, found, tests, tmp_path):
     first = json.loads((found[1] / "discovery.json").read_text(encoding="utf-8"))
     out = tmp_path / "again"
     shutil.copytree(found[1], out)
     (out / "figures" / "mine.png").write_text("a file of the user's")
-    text = done(call("discover", tests / "frame", "--out", out, *QUICK, "--no-figures", "--json"))
+    text = done(run("discover", tests / "frame", "--out", out, *QUICK, "--no-figures", "--json"))
     assert text == (out / "discovery.json").read_text(encoding="utf-8")
     assert set(snapshot(out)) == {"discovery.json", "discovery.msgpack", "figures", "figures/mine.png"}
     second = json.loads(text)
@@ -132,9 +121,9 @@ def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     assert first == second
 
 
-def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(tests, tmp_path):
+def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(run, tests, tmp_path):
     excluded = ["--exclude", "toe_asperity", "--exclude", "pop_in"]
-    text = done(call("discover", tests / "null", "--out", tmp_path, "--no-held-out", "--no-figures", *excluded))
+    text = done(run("discover", tests / "null", "--out", tmp_path, "--no-held-out", "--no-figures", *excluded))
     content = json.loads((tmp_path / "discovery.json").read_text(encoding="utf-8"))
     assert content["verdict"] == "NO_GAP"
     assert "Verdict: nothing missing" in text
@@ -144,14 +133,10 @@ def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(te
     assert names == set(LIBRARY) - {"toe_asperity", "pop_in"}
 
 
-def test_power_says_what_the_tests_could_show(tests, tmp_path):
-    excluded = [
-        part
-        for name in LIBRARY
-        if name not in ("frame_compliance", "platen_sink_in", "humidity")
-        for part in ("--exclude", name)
-    ]
-    text = done(call("power", tests / "null", "--out", tmp_path, *excluded))
+def test_power_says_what_the_tests_could_show(run, tests, tmp_path):
+    others = set(LIBRARY) - {"frame_compliance", "platen_sink_in", "humidity"}
+    excluded = [word for name in others for word in ("--exclude", name)]
+    text = done(run("power", tests / "null", "--out", tmp_path, *excluded))
     content = json.loads((tmp_path / "power.json").read_text(encoding="utf-8"))
     (frame, sink) = content["mechanisms"]
     assert (frame["mechanism"], frame["unit"], frame["visible"]) == ("frame_compliance", "um/mN", True)
@@ -162,7 +147,7 @@ def test_power_says_what_the_tests_could_show(tests, tmp_path):
     assert "frame_compliance" in text
     assert "humidity needs" in text
     assert (
-        done(call("power", tests / "null", "--out", tmp_path, *excluded, "--json"))
+        done(run("power", tests / "null", "--out", tmp_path, *excluded, "--json"))
         == json.dumps(content, ensure_ascii=False, indent=2) + "\n"
     )
 

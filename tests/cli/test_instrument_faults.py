@@ -5,7 +5,7 @@ import json
 import faulty
 import numpy as np
 import pytest
-from asserting import refused
+from asserting import done, refused
 
 from mcc_jax.campaign import Campaign, write_campaign
 
@@ -24,35 +24,32 @@ def tests(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def fitted(tests, tmp_path_factory):
+def fitted(run, tests, tmp_path_factory):
     """`calibrate`, then `report`: what was printed, and the folder."""
-    from click.testing import CliRunner
-
-    from mcc_jax.cli.main import cli
-
     out = tmp_path_factory.mktemp("fitted") / "out"
-    result = CliRunner().invoke(cli, ["calibrate", str(tests), "--out", str(out), *FIT], prog_name="mcc-jax")
-    assert result.exit_code == 0, (result.stdout, result.stderr, result.exception)
-    page = CliRunner().invoke(cli, ["report", str(out), "--campaign", str(tests)], prog_name="mcc-jax")
-    return result, out, page
+    printed = done(run("calibrate", tests, "--out", out, *FIT))
+    done(run("report", out, "--campaign", tests))
+    return printed, out
 
 
-def test_findings_stand_in_the_result_and_on_the_terminal(fitted):
-    result, out, _ = fitted
+def test_findings_are_in_the_result_on_the_terminal_and_on_the_page(fitted):
+    printed, out = fitted
     content = json.loads((out / "calibration.json").read_text())
     found = {one["check"]: one for one in content["findings"]}
     assert found["zero of force"]["level"] == "info"
     assert found["breakage"]["particles"] == ["3"]
     assert "without it the modulus is" in found["breakage"]["sentence"]
     for one in found.values():
-        assert one["sentence"] in " ".join(result.stdout.split())
+        assert one["sentence"] in " ".join(printed.split())
     for entry in content["particles"]:
         assert entry["force_zero_mN"]["value"] == pytest.approx(20.0, abs=0.1)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    for words in ("Tests: breakage", "the particle broke at", "Tests: zero of force"):
+        assert words in page
 
 
 def test_leave_out_takes_particles_out_by_name(run, tests, tmp_path):
-    result = run("calibrate", tests, "--out", tmp_path / "out", "--leave-out", "3", "--leave-out", "5", *FIT)
-    assert (result.exit_code, result.stderr) == (0, ""), result.exception
+    done(run("calibrate", tests, "--out", tmp_path / "out", "--leave-out", "3", "--leave-out", "5", *FIT))
     content = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert [entry["particle"] for entry in content["particles"]] == ["1", "2", "4"]
     assert [one["check"] for one in content["findings"]] == ["zero of force"]
@@ -103,15 +100,4 @@ def test_convert_tells_what_it_finds(run, tmp_path):
         (tmp_path / f"{name}.csv").write_text(text)
         out = tmp_path.parent / f"{tmp_path.name}-{name}"
         mapping = ("--mapping", tmp_path / "m.toml", "--diameters", "213.54,196.07,186.33")
-        result = run("convert", tmp_path / f"{name}.csv", "--out", out, *mapping)
-        assert (result.exit_code, result.stderr) == (0, ""), result.exception
-        assert words in " ".join(result.stdout.split())
-
-
-def test_the_page_shows_them_with_their_light(fitted):
-    _, out, page = fitted
-    assert page.exit_code == 0, (page.stdout, page.stderr)
-    html = (out / "report.html").read_text(encoding="utf-8")
-    assert "Tests: breakage" in html
-    assert "the particle broke at" in html
-    assert "Tests: zero of force" in html
+        assert words in " ".join(done(run("convert", tmp_path / f"{name}.csv", "--out", out, *mapping)).split())

@@ -36,43 +36,33 @@ def kept(tmp_path, monkeypatch):
 
 
 @posix
-def test_the_folder_of_what_is_compiled_is_closed_to_others(kept):
+def test_the_folder_of_what_is_compiled_is_closed_to_others(kept, monkeypatch):
+    """Compiled code is run: a folder that others own, or can write to, is not used."""
     folder = kept()
     assert folder.parent == kept.above
     for one in (folder, kept.above):
         assert stat.S_IMODE(one.stat().st_mode) == 0o700
-
-
-@posix
-@pytest.mark.parametrize("open_to", [0o020, 0o002])
-@pytest.mark.parametrize("which", ["above", "folder"])
-def test_a_folder_that_others_can_write_to_is_not_used(kept, which, open_to):
-    """Compiled code is run."""
-    folder = kept()
-    (kept.above if which == "above" else folder).chmod(0o700 | open_to)
-    assert kept() is None
-
-
-@posix
-def test_a_folder_of_somebody_else_is_not_used(kept, monkeypatch):
-    folder = kept()
+        for open_to in (0o020, 0o002):
+            one.chmod(0o700 | open_to)
+            assert kept() is None
+        one.chmod(0o700)
+    assert kept() == folder
     monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
     assert kept() is None
 
 
 @posix
-@pytest.mark.parametrize("level", ["above", "folder"])
 @pytest.mark.parametrize("kind", ["link", "file", "pipe"])
-def test_what_is_no_folder_is_not_used(kept, tmp_path, level, kind):
-    place = kept()
-    place.rmdir()
-    if level == "above":
-        place = kept.above
-        place.rmdir()
+def test_what_is_no_folder_is_not_used(kept, tmp_path, kind):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir(mode=0o700)
-    {"link": lambda: place.symlink_to(elsewhere), "file": place.touch, "pipe": lambda: os.mkfifo(place)}[kind]()
-    assert kept() is None
+    make = {"link": lambda p: p.symlink_to(elsewhere), "file": Path.touch, "pipe": os.mkfifo}[kind]
+    place = kept()
+    for one in (place, kept.above):
+        one.rmdir()
+        make(one)
+        assert kept() is None
+        one.unlink()
     assert list(elsewhere.iterdir()) == []
 
 

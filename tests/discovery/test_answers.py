@@ -117,7 +117,7 @@ def test_a_summary_is_plain_english(verdict):
 
 def test_two_names_in_place_of_one_are_told_together():
     told = answer("SET", pairs=(("creep", "reverse_plasticity"),)).summary
-    assert "cannot tell it from frame compliance or creep together with reverse plasticity" in told
+    assert "cannot distinguish it from frame compliance or creep together with reverse plasticity" in told
 
 
 def test_an_amplitude_beyond_reason_is_said():

@@ -8,7 +8,7 @@ from asserting import refused
 from calibrations import content, estimate, write
 from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
 
-from mcc_jax.cli.export import FORMATS as OFFERED
+from mcc_jax.cli.outputs import FORMATS as OFFERED
 from mcc_jax.export import FORMATS, read_calibration
 
 FILES = {

@@ -1,7 +1,6 @@
 """The figures of the joint calibrations: they draw for campaigns of every size, and show what the calibration holds."""
 
 import dataclasses
-import itertools
 import re
 
 import matplotlib as mpl
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
+from reading_figures import check_layout, check_words, panels, texts
 from scipy.stats import nakagami
 
 from mcc_jax.calibrate import least_squares, sample
@@ -24,20 +24,12 @@ from mcc_jax.plots import (
     posterior_figures,
     save_figures,
 )
-from mcc_jax.plots.posterior import (
-    PARAMETERS,
-    CoefficientTable,
-    draw_forest,
-    enlarged_prior,
-    posterior_table,
-    shrinkage,
-)
+from mcc_jax.plots.posterior import CoefficientTable, density, draw_forest, posterior_table, prior_near, shrinkage
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
 KINDS = ("paper", "one", "odd")
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
-UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
 
 pytestmark = pytest.mark.extended
 
@@ -81,26 +73,6 @@ def figures(calibrations, kind, tmp_path_factory):
     return found
 
 
-def texts(figure):
-    return [t.get_text() for t in figure.findobj(mpl.text.Text) if t.get_text()]
-
-
-def panels(figure):
-    """Axes with data, without colour bars and panels left blank."""
-    return [ax for ax in figure.axes if ax.get_label() != "<colorbar>" and ax.axison]
-
-
-def shown_ticks(axis):
-    """Tick labels that are drawn: those within the axis."""
-    low, high = sorted(axis.get_view_interval())
-    labels = [tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
-    return [label for label in labels if label.get_visible() and label.get_text()]
-
-
-def within(box, page):
-    return page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
-
-
 # ---- all figures -----------------------------------------------------------------------------------------------------
 
 
@@ -121,30 +93,10 @@ def test_every_figure_has_its_panels(figures, kind):
     assert {stem: len(panels(figure)) for stem, figure in figures.items()} == expected
 
 
-def test_every_axis_has_its_unit_and_simulated_data_are_called_so(figures):
-    for stem, figure in figures.items():
-        assert texts(figure).count("simulated data") == 1
-        for ax in panels(figure):
-            shown = [label for label in (ax.get_xlabel(), ax.get_ylabel()) if label]
-            assert all(UNIT.search(label) for label in shown), (stem, shown)
-
-
 @pytest.mark.extended
-def test_nothing_is_clipped_and_no_panels_overlap(figures):
-    for stem, figure in figures.items():
-        page = figure.bbox.padded(1)
-        for text in [*figure.texts, *(t for one in figure.legends for t in one.get_texts())]:
-            assert within(text.get_window_extent(), page), (stem, text)
-        for ax in panels(figure):
-            ticks = [*shown_ticks(ax.xaxis), *shown_ticks(ax.yaxis)]
-            titles = [t for t in (ax.xaxis.label, ax.yaxis.label, ax.title, ax._left_title) if t.get_text()]
-            for text in [*ticks, *titles]:
-                assert within(text.get_window_extent(), page), (stem, text)
-            for text in titles:
-                box = text.get_window_extent()
-                assert not any(box.overlaps(other.bbox) for other in figure.axes if other.axison), (stem, text)
-            boxes = sorted((t.get_window_extent() for t in shown_ticks(ax.xaxis)), key=lambda b: b.x0)
-            assert all(a.x1 <= b.x0 for a, b in itertools.pairwise(boxes)), (stem, ax.get_xlabel())
+def test_words_and_layout(figures):
+    check_words(figures)
+    check_layout(figures, ticks=True)
 
 
 def test_names_are_drawn_as_they_stand(calibrations):
@@ -283,9 +235,8 @@ def test_whitened_residuals_are_standard(calibrations):
 
 def test_a_prior_that_piles_up_at_zero_is_no_level_line_where_it_is_enlarged():
     prior = nakagami.rvs(0.125, size=20_000, random_state=0)
-    x, y = enlarged_prior(prior, 0.01, PARAMETERS["tau_C3"])
+    x, y = density(prior_near(prior, 0.01))
     assert y.argmax() == 0
     assert x[-1] <= 0.02
     assert np.interp(0.01, x, y) < 0.2
-    x, _ = enlarged_prior(prior[:50], 0.01, PARAMETERS["tau_C3"])
-    assert x[-1] > 0.02  # too few draws near by: all of them
+    assert prior_near(prior[:50], 0.01).max() > 0.02  # too few draws near by: all of them

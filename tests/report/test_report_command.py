@@ -34,7 +34,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_damage_is_told_in_one_line_and_nothing_is_lost(run, folder, name):
+def test_damage_is_reported_in_one_line_and_nothing_is_lost(run, folder, name):
     file, content, words = DAMAGE[name]
     (folder / "report.html").write_text("the old page")
     (folder / file).write_bytes(content)
@@ -50,9 +50,9 @@ def test_json_alone_is_no_result(run, folder):
 
 
 def test_folders_without_results(run, folder, tmp_path):
-    assert "no such folder" in refused(run("report", tmp_path / "none"))
+    assert "No such file or directory" in refused(run("report", tmp_path / "none"))
     assert not (tmp_path / "none").exists()
-    assert "is a file" in refused(run("report", folder / "calibration.json"))
+    assert "Not a directory" in refused(run("report", folder / "calibration.json"))
     (tmp_path / "empty").mkdir()
     assert "nothing to report" in refused(run("report", tmp_path / "empty"))
     assert "curves.csv" in refused(run("report", folder, "--campaign", tmp_path / "empty"))
@@ -65,8 +65,8 @@ def test_from_raw_tests_to_the_page_by_the_papers_method(run, folder, tmp_path):
     result = run("calibrate", folder, "--out", fit, "--method", "paper", "--no-figures", "--threshold-MPa", "0.5")
     assert result.exit_code == 0, result.output
     content = json.loads((fit / "calibration.json").read_text(encoding="utf-8"))
-    told = content["provenance"]
-    assert told["settings"] == {
+    origin = content["provenance"]
+    assert origin["settings"] == {
         "command": "calibrate",
         "method": "paper",
         "leave_out": [],
@@ -77,8 +77,8 @@ def test_from_raw_tests_to_the_page_by_the_papers_method(run, folder, tmp_path):
         "strain_scaling": "raw",
         "seed": 0,
     }
-    assert told["campaign"] == {"folder": str(folder.resolve()), "sha256": file_checksums(folder)}
-    assert set(told["versions"]) >= {"mcc_jax", "jax", "python"}
+    assert origin["campaign"] == {"folder": str(folder.resolve()), "sha256": file_checksums(folder)}
+    assert set(origin["versions"]) >= {"mcc_jax", "jax", "python"}
     found = read_results(fit)
     assert found.cautions == ()
     for one, entry in zip(compare(found), content["particles"], strict=True):

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from mcc_jax.effects import default_library
-from mcc_jax.report.tables import GREEK, equation
+from mcc_jax.report.texts import GREEK, equation
 
 
 def test_equations_are_written_with_greek_letters_indices_and_powers():

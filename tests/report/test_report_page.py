@@ -1,4 +1,4 @@
-"""What stands in the page: predictions that are true, every section filled, nothing loaded from anywhere."""
+"""What is in the page: predictions that are true, every section filled, nothing loaded from anywhere."""
 
 import dataclasses
 import json
@@ -22,8 +22,8 @@ from mcc_jax.discovery.sentences import headline
 from mcc_jax.report import read_results, report_page
 from mcc_jax.report.chart import chart_data, chart_items, compare
 from mcc_jax.report.checks import check_results, share_inside
-from mcc_jax.report.pictures import Example, example_pictures
-from mcc_jax.report.sentences import calibration_sentences, next_steps
+from mcc_jax.report.story import Example, example_pictures
+from mcc_jax.report.texts import calibration_sentences, next_steps
 
 SECTIONS = {"summary", "measured", "law", "compare", "posterior", "diagnostics", "discovery", "settings", "cite"}
 ALWAYS = {"summary", "law", "settings", "cite"}
@@ -33,7 +33,7 @@ OF_PART = {
     "posterior": set(),
     "discovery": {"discovery", "diagnostics"},
 }
-"""Sections that stand in a page only where there is something to show."""
+"""Sections that are in a page only where there is something to show."""
 PARTS = {
     "campaign": ("particles.csv", "curves.csv", "campaign.toml"),
     "calibration": ("calibration.json", "calibration.msgpack"),
@@ -59,15 +59,17 @@ def changed(folder, name="calibration.msgpack", **changes):
     return read_results(folder)
 
 
+def text_of(results):
+    return Page(report_page(results)).text
+
+
 def keep(folder, *parts):
     """Leave only these parts in the folder, and nothing that points elsewhere."""
-    for part, names in PARTS.items():
-        for name in names:
-            if part not in parts:
-                (folder / name).unlink()
-    for name in ("calibration.json", "discovery.json"):
-        if (folder / name).exists():
+    for part in set(PARTS) - set(parts):
+        for name in PARTS[part]:
             (folder / name).unlink()
+    for name in ("calibration.json", "discovery.json"):
+        (folder / name).unlink(missing_ok=True)
     if "calibration" in parts and "posterior" not in parts:
         changed(folder, method="least-squares")
 
@@ -210,12 +212,11 @@ def test_of_many_points_turns_stay_and_of_many_particles_the_worst(without_poste
 
 
 def test_rounding_in_the_page_does_not_show(shown):
-    rng = np.random.default_rng(0)
-    one = shown[0]
-    one = dataclasses.replace(one, displacement_um=one.own_um + 1e-4 * rng.standard_normal(len(one.own_um)))
+    away = 1e-4 * np.random.default_rng(0).standard_normal(len(shown[0].own_um))
+    one = dataclasses.replace(shown[0], displacement_um=shown[0].own_um + away)
     column = chart_data([one], ["1"], [""])["particles"][0]
     residual = np.array(column["displacement"]) - np.array(column["own"])
-    np.testing.assert_allclose(residual, one.displacement_um - one.own_um, atol=2e-6)
+    np.testing.assert_allclose(residual, away, atol=2e-6)
 
 
 def test_sections_are_filled_and_the_page_is_whole(page):
@@ -248,6 +249,8 @@ def test_nothing_is_loaded_from_anywhere(page):
         assert all(value.startswith(("data:image/", "#")) for value in loads), (tag, attributes)
         assert "url(" not in attributes.get("style", "")
     assert not others(page)
+    # Bokeh's script as it is shipped loads fonts of formulas and maps.
+    assert len(others(files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text("utf-8"))) >= 2
 
 
 LOADING = ("src", "srcset", "href", "xlink:href", "data", "poster", "background", "action", "formaction", "ping")
@@ -265,12 +268,6 @@ def others(text):
     """Addresses in other places than this machine that a text holds, but for the harmless ones."""
     found = re.findall(r"""(?:https?|wss?|ftp):\\?/\\?/[^"'`\s<>)\\]*""", text)
     return {a.rstrip(".,") for a in found if not re.fullmatch(HARMLESS, a.rstrip(".,")) and "//localhost:" not in a}
-
-
-def test_a_loader_would_be_seen():
-    """Bokeh's script as it is shipped loads fonts of formulas and maps."""
-    assert len(others(files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text("utf-8"))) >= 2
-    assert others("import('https://shown.invalid/a.js')") == {"https://shown.invalid/a.js"}
 
 
 @pytest.mark.parametrize(
@@ -312,18 +309,18 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
         ("FIT_NOT_CONVERGED", "could not be fitted well enough"),
     ],
 )
-def test_every_verdict_is_told(folder, verdict, words):
+def test_every_verdict_is_reported(folder, verdict, words):
     keep(folder, "discovery")
     empty = {"effects": [], "candidate_set": [], "where": [], "next_experiments": [], "parameters_after": {}}
     closure = {"formula": "0.1 * x**2", "resembles": [["creep", 0.7]], "selection_frequency": 0.9}
     more = {"NO_GAP": empty, "UNLISTED": empty | {"closure": closure}, "FIT_NOT_CONVERGED": empty | {"ranking": []}}
-    text = Page(report_page(changed(folder, "discovery.msgpack", verdict=verdict, **more.get(verdict, {})))).text
+    text = text_of(changed(folder, "discovery.msgpack", verdict=verdict, **more.get(verdict, {})))
     assert words in text
     assert ("0.1 * x**2" in text) == (verdict == "UNLISTED")
 
 
 def test_the_first_screen_tells_verdict_gap_and_modulus(page):
-    """A share of the gap never stands alone: chi2 per point is beside it wherever the share is told."""
+    """A share of the gap is nowhere without chi2 per point."""
     read = Page(page)
     assert list(read.sections) == [name for name in ORDER if name in read.sections]
     top = read.sections["summary"]
@@ -341,24 +338,14 @@ def test_the_first_screen_tells_verdict_gap_and_modulus(page):
         assert "χ² per point" in text[place : place + 200]
         assert "falls from 2 to 2" in text[place : place + 300]
     assert not [word for word in UNDERSCORED.findall(read.text) if word not in ALLOWED]
+    numbers = "effectivemodulus[GPa]9.000±0.0508.902to9.09816.000000±0.000010"  # before and after, with intervals
+    assert numbers in "".join(read.sections["discovery"].split())
 
 
 ORDER = ("summary", "compare", "law", "posterior", "diagnostics", "discovery", "measured", "settings", "cite")
 UNDERSCORED = re.compile(r"[A-Za-z]+_[A-Za-z_]+")
 # The package, a formula, and a column that a user must call so.
 ALLOWED = {"mcc_jax", "D_e", "relative_humidity_percent"}
-
-
-def telling(gap_at, points=60):
-    """A test of rising load whose law is wrong in one place."""
-    rows = np.arange(points, dtype=float)
-    before = np.where(np.abs(rows - gap_at) < 4, 0.5, 0.0)
-    return Example(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
-
-
-def test_parameters_before_and_after_stand_there_as_numbers(page):
-    told = "".join(Page(page).sections["discovery"].split())
-    assert "effectivemodulus[GPa]9.000±0.0508.902to9.09816.000000±0.000010" in told
 
 
 def test_no_line_breaks_within_a_number_and_commands_can_be_copied(folder):
@@ -372,14 +359,18 @@ def test_no_line_breaks_within_a_number_and_commands_can_be_copied(folder):
 
 @pytest.mark.parametrize("gap_at", [5, 30, 55])
 def test_the_enlarged_part_holds_the_largest_gap(gap_at):
-    told = telling(gap_at)
-    assert told.near[gap_at]
-    assert told.near.sum() < 20
-    assert telling(2, points=4).near.sum() > 1  # of a record with few readings more is shown, never one
-    assert [look["label"] for _, look in told.laws] == ["law alone", "law with creep"]
-    assert all(
-        source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in example_pictures(told)
-    )
+    """A test of rising load whose law is wrong in one place."""
+    rows = np.arange(60.0)
+    before = np.where(np.abs(rows - gap_at) < 4, 0.5, 0.0)
+    example = Example(rows, rows**2, rows, before, "Particle 1.", after_um=0 * rows, added="law with creep")
+    assert example.near[gap_at]
+    assert example.near.sum() < 20
+    few = Example(*(np.arange(4.0) for _ in range(4)), "")
+    assert few.near.sum() > 1  # of a record with few readings more is shown, never one
+    assert [look["label"] for _, look in example.laws] == ["law alone", "law with creep"]
+    for source, words in example_pictures(example):
+        assert source.startswith("data:image/svg+xml")
+        assert "Particle 1" in words
 
 
 @pytest.mark.parametrize(("chi2", "words"), [(1.02, "agree within the noise"), (1.4, "part remains")])
@@ -390,29 +381,26 @@ def test_a_gap_is_called_closed_only_where_chi2_says_so(chi2, words):
 
 
 @pytest.mark.parametrize(("power", "words"), [(0.95, "Measure: a hold"), (0.3, "would surely separate")])
-def test_an_experiment_that_may_not_tell_is_not_simply_recommended(folder, power, words):
+def test_an_experiment_that_may_not_separate_is_not_simply_recommended(folder, power, words):
     keep(folder, "discovery")
     one = {"experiment": "a hold of 60 s at the largest load", "separates": ["frame_compliance", "creep"]}
     further = [{**one, "particles": 6, "power": power}]
-    text = Page(report_page(changed(folder, "discovery.msgpack", verdict="SET", next_experiments=further))).text
+    text = text_of(changed(folder, "discovery.msgpack", verdict="SET", next_experiments=further))
     assert words in text
     assert ("Measure: a hold" in text) == (power > 0.9)
 
 
-def test_what_would_show_each_candidate_by_itself_is_told(folder):
+def test_what_would_show_each_candidate_by_itself_is_there(folder):
     keep(folder, "discovery")
     checks = [
         {"mechanism": "frame_compliance", "check": "press the bare platen"},
         {"mechanism": "platen_sink_in", "check": "repeat on diamond"},
     ]
-    text = Page(
-        report_page(changed(folder, "discovery.msgpack", verdict="SET", next_experiments=[], checks=checks))
-    ).text
+    text = text_of(changed(folder, "discovery.msgpack", verdict="SET", next_experiments=[], checks=checks))
     assert "None is proposed" in text
     assert "Check directly. For frame compliance: press the bare platen." in text
     assert "platen sink in: repeat on diamond." in text
-    without = Page(report_page(changed(folder, "discovery.msgpack", checks=[]))).text
-    assert "by itself" not in without
+    assert "by itself" not in text_of(changed(folder, "discovery.msgpack", checks=[]))
 
 
 def test_equal_input_gives_an_equal_page(complete, page):
@@ -493,13 +481,13 @@ def test_figures_are_only_those_that_the_results_name_as_theirs(folder):
         ("The law's form fits", {"own_misfit": 0.2}, "bad"),
     ],
 )
-def test_lights_change_where_the_gates_are(results, check, changes, level):
+def test_checks_change_where_the_gates_are(results, check, changes, level):
     content = {**results.calibration, "diagnostics": results.calibration["diagnostics"] | changes}
     found = {one.check: one for one in check_results(dataclasses.replace(results, calibration=content))}
     assert found[check].level == level
 
 
-def test_misfit_is_measured_where_the_calibration_does_not_tell_it(results, shown):
+def test_misfit_is_measured_where_the_calibration_does_not_report_it(results, shown):
     diagnostics = {**results.calibration["diagnostics"], "own_misfit": None}
     silent = dataclasses.replace(results, calibration={**results.calibration, "diagnostics": diagnostics})
     bad = [dataclasses.replace(one, displacement_um=1.1 * one.displacement_um) for one in shown]

@@ -167,7 +167,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
             "no minimum has positive shape factors of all particles; the curves do not collapse under this shape factor"
         )
     if not identifiable:
-        reason = "all particles have the same D3^2/(D1 D2), so the curves do not tell the shape parameter"
+        reason = "all particles have the same D3^2/(D1 D2), so the curves do not determine the shape parameter"
     at, at_zero = (float(objective_at(value, quadratics)) for value in (a, 0.0))
     kept = None if row is None else int(table.index[row])
     return ShapeFit(a, at, at_zero, objective, kept, not reason, reason, identifiable)

@@ -1,4 +1,4 @@
-"""`mcc-jax export`."""
+"""`mcc-jax report` and `mcc-jax export`: results for people, and for other programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,42 @@ from .._store import results
 from . import options as common
 from .session import say, say_files, sentence, session
 
+REPORT = "report.html"
 FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
+
+
+@click.command(short_help="One page that shows all results.")
+@click.argument("folder", type=common.Location(), metavar="DIR")
+@common.out()
+@click.option(
+    "--campaign", type=common.Location(), metavar="CAMPAIGN", help="Folder of the tests, if the results do not know it."
+)
+@common.no_seed
+def report(folder: Path, out: Path | None, campaign: Path | None) -> None:
+    """Write one self-contained HTML page from what is in the folder DIR: a campaign, calibration.json with
+    posterior.nc, discovery.json, or any of them.
+
+    Writes report.html into DIR, or into the folder given by --out. It needs no network, opens in any browser, and can
+    be sent or printed. The tests are looked for in DIR, in DIR/campaign, and where calibration or discovery found them.
+
+    \b
+    Examples:
+      mcc-jax report mcc-jax-demo
+      mcc-jax report my-fit --campaign my-tests --out for-my-colleague
+    """
+    with session(4) as progress:
+        from ..report import read_results, report_page
+
+        progress("reading the results")
+        found = read_results(folder, campaign)
+        page = report_page(found, progress=progress)
+        with results(out or folder) as stage:
+            (stage.folder / REPORT).write_text(page, encoding="utf-8")
+    for text in found.cautions:
+        say(f"Caution: {text}.", fg="yellow")
+    for text in found.missing:
+        say(f"Not in the report: {text}.", fg="yellow")
+    say(f"Written: {(out or folder) / REPORT} ({len(page.encode()) / 1e6:.1f} MB). Open it in a browser.")
 
 
 @click.command(short_help="Hand the calibrated law to other engines.")
@@ -18,11 +53,9 @@ FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
 @click.option("--format", "form", type=click.Choice(FORMATS), required=True, help="What to write; see below.")
 @common.out(required=True)
 @click.option("--particle", metavar="NAME", help="Take this particle's coefficients instead of the population's.")
-@click.option(
-    "--diameters",
-    metavar="D1,D2,D3|FILE",
-    help="Diameters in um of the particle that the golden table shows, or a table of particles (its row of that "
-    "particle, or its mean).  [default: the particles of the calibrated campaign]",
+@common.diameters(
+    "Diameters in um of the particle that the golden table shows, or a table of particles (its row of that particle, "
+    "or its mean).  [default: the particles of the calibrated campaign]"
 )
 @click.option(
     "--allow-not-monotone", is_flag=True, help="Export a law whose stress falls on loading, instead of refusing it."
@@ -56,8 +89,6 @@ def export(
       mcc-jax export fit --format c --out law
       mcc-jax export fit --format json --out law --particle 7 --diameters tests/particles.csv
     """
-    if diameters is not None and not diameters.strip():
-        raise click.BadParameter("it is empty.", param_hint="--diameters")
     with session(3) as progress:
         from ..export import read_calibration, write_export
 

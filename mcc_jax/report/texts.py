@@ -1,0 +1,279 @@
+"""What the results say in plain words and in tables: sentences, next steps, facts, parameters, particles, equations."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._format import interval, listed, number, percent, plain, probability, span, with_sd
+from ..calibrate.curves import FittedCurve
+from ..calibrate.estimates import quantities
+from ..campaign import Campaign, campaign_segments, effective_diameter_um
+from ..discovery.settings import ENOUGH
+from ..plots.style import is_simulated
+from .read import Results
+
+METHODS = {
+    "bayes": "the joint posterior of all tests at once",
+    "least-squares": "joint least squares of all tests at once (Optimistix)",
+    "paper": "the paper's own steps, one after the other",
+}
+SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
+GREEK_NAMES = ("sigma", "eps", "tau", "eta", "kappa", "gamma", "mu", "alpha", "phi", "pi", "Delta")
+GREEK = dict(zip(GREEK_NAMES, "σετηκγμαφπΔ", strict=True))
+KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
+
+
+def quantity(name: str) -> str:
+    """A key with its unit for a person: `compliance_um_per_mN` is "compliance [µm/mN]"."""
+    units = {"um": "µm", "percent": "%"} | {one: one for one in ("mN", "MPa", "s")}
+    words = name.split("_")
+    start = next((k for k in range(1, len(words)) if all(w in units or w == "per" for w in words[k:])), len(words))
+    unit = "".join("/" if word == "per" else units[word] for word in words[start:])
+    label = " ".join(words[:start])
+    return f"{label} [{'1' * unit.startswith('/')}{unit}]" if unit else label
+
+
+def equation(text: str) -> Any:
+    """An equation as the library writes it, for a page: Greek letters, indices and powers."""
+    from markupsafe import Markup, escape
+
+    def name(match: re.Match[str]) -> str:
+        letter, number, below = match["letter"], match["number"] or "", (match["below"] or "_")[1:]
+        return f"<i>{GREEK.get(letter, letter)}</i>" + (f"<sub>{number}{below}</sub>" if number or below else "")
+
+    # An `s` after a number is a second, and the `a` of "on a reload" no length.
+    second = r"(?!(?<=[\da][ /])s\b|(?<=N/)s\b)"
+    letters = rf"(?P<letter>{'|'.join(GREEK)}|[A-Za-z])(?P<number>\d)?(?P<below>_\w+)?\b"
+    written = re.sub(rf"(?<!on )\b{second}{letters}", name, str(escape(text)).replace("&#39;", "′"))
+    raised = r"\^(?:\((?P<bracketed>[^()]*)\)|(?P<plain>-?(?:<i>\w+</i>|[\d.]*\d)))"
+    written = re.sub(raised, lambda match: f"<sup>{match['bracketed'] or match['plain']}</sup>", written)
+    for pattern, sign in ((r"(?<=[\s(>])-", "−"), (r"\bum\b", "µm")):
+        written = re.sub(pattern, sign, written)
+    return Markup(written)
+
+
+# ---- which law -------------------------------------------------------------------------------------------------------
+
+
+def simulated(results: Results) -> bool:
+    """Whether these data were computed, not measured."""
+    return results.campaign is not None and is_simulated(results.campaign.metadata)
+
+
+def is_law_alone(results: Results) -> bool:
+    """Whether the calibration is of the law without the effects that were found to be missing in it."""
+    found, calibration = results.discovery, results.calibration
+    return bool(found and found["effects"] and calibration and not calibration.get("effects"))
+
+
+def law_of(results: Results) -> str:
+    """What the law of the calibration is called: "the law", alone or with its effects where that matters."""
+    if is_law_alone(results):
+        return "the law alone"
+    effects = (results.calibration or {}).get("effects")
+    return f"the law with {listed([plain(effect['mechanism']) for effect in effects])}" if effects else "the law"
+
+
+# ---- sentences -------------------------------------------------------------------------------------------------------
+
+
+def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list[str]:
+    """A `calibration.json` in a few sentences; of the law "alone", which lacks something, no numbers are shown."""
+    count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
+    found = [
+        f"{law[:1].upper()}{law[1:]} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
+        + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
+    ]
+    if law.endswith("alone"):
+        return found
+    sure = SURE.get(content["method"])
+    if sure is None:
+        found.append("This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both.")
+    else:
+        known = [
+            f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
+            for name, key, factor, unit in (
+                ("the shape parameter a, how much more flat particles are strained than spheres,", "a", 1.0, ""),
+                ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
+            )
+            if content[key]["interval_95"] is not None
+        ]
+        if known:
+            found.append(f"Given {law} and these tests, {listed(known)}, each {sure}.")
+    misfit = content["diagnostics"].get("own_misfit")
+    if misfit is not None:
+        found.append(
+            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
+            f"{percent(misfit)} of its range (median over the particles)."
+        )
+    return found
+
+
+def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
+    """What to do next: a sentence and a command (or nothing) each, the most urgent first."""
+    steps: list[tuple[str, str]] = []
+    content, found, calibrate = results.calibration, results.discovery, f"mcc-jax calibrate CAMPAIGN --out {folder}"
+    if results.campaign is None:
+        steps.append(("Show measured against predicted:", f"mcc-jax report {folder} --campaign CAMPAIGN"))
+    if content is None:
+        steps.append(("Calibrate the law on these tests:", calibrate))
+    elif not content["converged"]:
+        lacking = (
+            "The law alone does not fit these tests, which may be why its calibration did not converge; what failed "
+            "is listed under Checks."
+        )
+        first = "Resolve what failed under Checks before anything else."
+        steps.append((lacking if found is not None and found["effects"] else first, ""))
+    elif content["method"] != "bayes":
+        paper = content["method"] == "paper"
+        what = "the uncertainty of every number" if paper else "the posterior, not only a best fit"
+        steps.append((f"Get {what}:", calibrate))
+    if found is None:
+        steps.append(("Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"))
+    else:
+        steps += _after(found, added=results.has_found)
+    if content is not None and content["converged"] and (found is None or found["verdict"] == "NO_GAP"):
+        steps.append(("Predict tests that you plan:", "mcc-jax simulate --out planned"))
+    return steps
+
+
+def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
+    """The command that calibrates the law with the effects of a `discovery.json`; empty where no options can say it.
+
+    `campaign` is the folder of the tests, quoted for a shell.
+    """
+    named = [":".join(filter(None, (effect["mechanism"], effect["variant"]))) for effect in found["effects"]]
+    if not named or found["closure"]:
+        return ""
+    options = " ".join(f"--effect {shlex.quote(name)}" for name in named)
+    return f"mcc-jax calibrate {campaign} {options} --out with-effect"
+
+
+def _after(found: dict[str, Any], *, added: bool) -> list[tuple[str, str]]:
+    """What to do after a discovery; `added` if the page is of the law with what was added already."""
+    verdict = found["verdict"]
+    if found["next_experiments"]:
+        best = found["next_experiments"][0]
+        names, power = listed([plain(n) for n in best["separates"]]), probability(best["power"])
+        test = f"{best['experiment']}, {number(best['particles'])} further particles"
+        if best["power"] >= ENOUGH:
+            return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
+        doubt = f"No further test of those tried on paper would surely separate {names}."
+        return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]
+    if found["checks"]:
+        first = found["checks"][0]
+        return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
+    if verdict in ("NAMED", "SET", "UNLISTED"):
+        if added:
+            return [("Use the law together with what was added: the parameters below are of both.", "")]
+        use = "Use the law together with what was added (parameters “after” below), not alone"
+        command = calibration_with_found(found, "CAMPAIGN")
+        return [(f"{use}. All about it, from every particle's curve to the checks:" if command else f"{use}.", command)]
+    if verdict == "NO_GAP" and found["untestable"]:
+        needs = sorted({entry["needs"] for entry in found["untestable"]})
+        return [(f"To learn about more mechanisms, the tests need {listed(needs)}.", "")]
+    return []
+
+
+def spread(log: dict[str, Any]) -> str:
+    """How much particles differ in a coefficient, in words: of mean and standard deviation of its logarithm."""
+    mean, sd = log["mean"]["value"], log["sd"]["value"]
+    if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
+        return "How much particles differ; these data do not show it."
+    if sd < 1e-3:
+        return "How much particles differ: hardly at all in these data."
+    low, high = number(math.exp(mean - sd), 3), number(math.exp(mean + sd), 3)
+    return f"How much particles differ: two of three lie between {low} and {high}."
+
+
+# ---- tables ----------------------------------------------------------------------------------------------------------
+
+
+def measured(campaign: Campaign) -> list[tuple[str, str]]:
+    """Facts of a campaign, name and value."""
+    sizes, meta = campaign.diameters_um, campaign.metadata
+    peaks = np.array([curve.force_mN.max() for curve in campaign.curves])
+    stress = 1e3 * peaks / (math.pi * np.array([effective_diameter_um(one) / 2 for one in sizes]) ** 2)
+    counts = Counter(part.kind for parts in campaign_segments(campaign) for part in parts)
+    resolution = [
+        f"{number(value)} {unit}"
+        for value, unit in ((meta.force_resolution_mN, "mN"), (meta.displacement_resolution_um, "µm"))
+        if value is not None
+    ]
+    return [
+        ("Tests", f"{len(campaign)} particles, {sum(len(c) for c in campaign.curves)} points"),
+        ("Diameters", span(sizes.ravel(), "µm")),
+        ("Flatness 1 − D₃²/(D₁D₂)", span(1 - sizes[:, 2] ** 2 / (sizes[:, 0] * sizes[:, 1]), "", 2)),
+        ("Largest force", span(peaks, "mN")),
+        ("Largest stress", span(stress, "MPa", 3)),
+        ("Segments", ", ".join(f"{counts[kind]} × {word}" for kind, word in KINDS.items() if counts[kind])),
+        ("Duration", span([float(c.time_s[-1] - c.time_s[0]) for c in campaign.curves], "s")),
+        ("Control", {"load": "force", "displacement": "displacement", None: "not recorded"}[meta.control]),
+        ("Resolution", ", ".join(resolution) or "not recorded"),
+        *([("Punch", f"{number(punch)} µm diameter")] if (punch := meta.punch_diameter_um) is not None else []),
+        ("Corrections before", ", ".join(map(plain, meta.corrections)) or "none recorded"),
+        ("Provenance", meta.provenance or "not recorded"),
+    ]
+
+
+def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
+    """What a discovery did to the parameters: name, and before and after the value with its error, and its interval."""
+    before, after = (
+        {one.name: one for one in quantities(side) if one.estimate["value"] is not None} if side else {}
+        for side in (found["parameters_before"], found["parameters_after"])
+    )
+    rows = []
+    for name in before:
+        if name in after and not name.endswith("_sd_of_log"):
+            first = before[name]
+            label = f"{first.label} [{first.unit}]" if first.unit else first.label
+            both = (first, after[name])
+            rows.append((label, [(with_sd(q.estimate, q.factor), interval(q.estimate, q.factor)) for q in both]))
+    return rows
+
+
+def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
+    """One line about each particle, for the line below the chart."""
+    campaign = results.campaign
+    assert campaign is not None
+    entries = {e["particle"]: e for e in results.calibration["particles"]} if results.calibration else {}
+    facts = []
+    for one in shown:
+        sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(one.name)])
+        parts = [f"D₁ × D₂ × D₃ = {sizes}\N{NO-BREAK SPACE}µm"]
+        eta = entries.get(one.name, {}).get("eta_p", {}).get("value")
+        if eta is not None:
+            parts.append(f"shape factor {number(eta, 3)}")
+        if one.why_not is not None:
+            parts.append(f"not used: {one.why_not}")
+        elif one.rms_um is not None:
+            parts.append(f"root mean square of test − law {number(one.rms_um, 2)}\N{NO-BREAK SPACE}µm")
+        facts.append("; ".join(parts) + ".")
+    return facts
+
+
+def particle_rows(results: Results) -> list[dict[str, Any]]:
+    """The table of particles: sizes, what was measured, what was found, and whether it was used."""
+    campaign, content = results.campaign, results.calibration
+    entries = {e["particle"]: e for e in content["particles"]} if content else {}
+    rows = []
+    for i, name in enumerate(entries if campaign is None else campaign.particles):
+        entry, row = entries.get(name), {"name": name, "kept": None, "why_not": None}
+        if campaign is not None:
+            row["sizes"] = [number(d) for d in campaign.diameters_um[i]]
+            row["peak"] = number(float(np.max(campaign.curves[i].force_mN)))
+            row["points"] = len(campaign.curves[i])
+        if entry is not None:
+            kept = entry["kept"]
+            row |= {"kept": kept, "why_not": entry["why_not"], "eta": number(entry["eta_p"]["value"], 3)}
+            row["C"] = [with_sd(entry[c]) if kept else "–" for c in ("C1", "C3", "C5")]
+            row["rms"] = number(entry.get("own_rms_um", entry["rms_um"]), 2) if kept else "–"
+        rows.append(row)
+    return rows
