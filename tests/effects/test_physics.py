@@ -132,7 +132,7 @@ def test_creep_of_a_hold_needs_a_hold_and_begins_again_with_each():
     scale = 1e-4 * PARTICLE.effective_diameter * PARTICLE.stress(jnp.asarray(200.0))
     for name, once in (("hold_logarithmic", np.log1p(1.0)), ("hold_kelvin", -np.expm1(-1.0))):
         none, twice = (
-            added(LIBRARY["creep"][name], 1e-4, clean_record(force, time), tau_s=10.0) / scale
+            added(LIBRARY["creep"][name], 1e-4, clean_record(force, time), tau_s=10.0) / float(scale)
             for force in (ramps, holds)
         )
         np.testing.assert_allclose(none, 0, atol=1e-12)
