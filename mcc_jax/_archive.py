@@ -85,14 +85,13 @@ def _plain(value: Any, where: str) -> Any:
         return value
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return _array(value, where)
-    if isinstance(value, list):
-        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
-    if isinstance(value, tuple):
+    if isinstance(value, list | tuple):
         items = [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+        if isinstance(value, list):
+            return items
         return {"named": _name(type(value), where), "items": items} if hasattr(value, "_fields") else {"tuple": items}
     if isinstance(value, Mapping):
-        pairs = [[_plain(k, where), _plain(item, f"{where}[{k!r}]")] for k, item in value.items()]
-        return {"mapping": pairs}
+        return {"mapping": [[_plain(k, where), _plain(item, f"{where}[{k!r}]")] for k, item in value.items()]}
     if isinstance(value, type):
         return {"class": _name(value, where)}
     if dataclasses.is_dataclass(value):
@@ -118,10 +117,8 @@ def _trusted(module: str) -> bool:
 
 def _name(kind: type, where: str) -> str:
     if not _trusted(kind.__module__) or "<" in kind.__qualname__:
-        raise InputError(
-            f"{where} is of the class {kind.__module__}.{kind.__qualname__}, which is not of mcc_jax",
-            remedy="Such results cannot be read back; keep the script that makes them.",
-        )
+        problem = f"{where} is of the class {kind.__module__}.{kind.__qualname__}, which is not of mcc_jax"
+        raise InputError(problem, remedy="Such results cannot be read back; keep the script that makes them.")
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
@@ -148,25 +145,32 @@ def _built(value: Any) -> Any:
         return _class(value["enum"], enum.Enum)[value["name"]]
     if "class" in value:
         return _class(value["class"], object)
-    kind = _class(value["object"], object)
-    if not hasattr(kind, "__dataclass_fields__"):
-        raise TypeError(f"{value['object']} is no dataclass")
-    known = {f.name for f in dataclasses.fields(kind)} | set(getattr(kind, "archived", ()))
-    strangers = sorted(set(value["fields"]) - known)
-    if strangers:
-        raise TypeError(f"{kind.__name__} has no field {strangers[0]!r}")
+    return _object(_class(value["object"], object), value["fields"])
+
+
+def _object(kind: type, contents: Mapping[str, Any]) -> Any:
+    """An object with these fields, and with their defaults those that were not written; none of its code runs."""
+    if not dataclasses.is_dataclass(kind):
+        raise TypeError(f"{kind.__name__} is no dataclass")
+    known = {f.name: f for f in dataclasses.fields(kind)}
+    cached = getattr(kind, "archived", ())  # worked out once, by a cached property
     made = object.__new__(kind)
-    for name in set(value["fields"]) & set(getattr(kind, "archived", ())):  # worked out once, by a cached property
-        made.__dict__[name] = _built(value["fields"][name])
-    for f in dataclasses.fields(kind):
-        if f.name in value["fields"]:
-            object.__setattr__(made, f.name, _built(value["fields"][f.name]))
-        elif not f.metadata.get("archived", True):
-            object.__setattr__(made, f.name, None)
+    for name, content in contents.items():
+        if name in cached:
+            made.__dict__[name] = _built(content)
+        elif name in known:
+            object.__setattr__(made, name, _built(content))
+        else:
+            raise TypeError(f"{kind.__name__} has no field {name!r}")
+    for name, f in known.items():
+        if name in contents:
+            continue
+        if not f.metadata.get("archived", True):
+            object.__setattr__(made, name, None)
         elif f.default is not dataclasses.MISSING:
-            object.__setattr__(made, f.name, f.default)
+            object.__setattr__(made, name, f.default)
         elif f.default_factory is not dataclasses.MISSING:
-            object.__setattr__(made, f.name, f.default_factory())
+            object.__setattr__(made, name, f.default_factory())
     return made
 
 

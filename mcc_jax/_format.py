@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,12 @@ def number(value: float | int | None, digits: int = 4) -> str:
 def plain(name: str) -> str:
     """A mechanism's name, or a formula's, for a sentence: `platen_sink_in` is "platen sink in"."""
     return name.replace("_", " ")
+
+
+def first_few(names: Iterable[str], most: int = 6) -> str:
+    """Names in a row, of many the first ones only."""
+    shown = list(names)
+    return ", ".join(shown[:most]) + (", ..." if len(shown) > most else "")
 
 
 def listed(names: Sequence[str], word: str = "and") -> str:
@@ -95,7 +101,7 @@ def probability(value: float | int | None) -> str:
 
 def span(values: Any, unit: str, digits: int = 4) -> str:
     """Smallest and largest, or the one value."""
-    low, high = number(float(min(values)), digits), number(float(max(values)), digits)
+    low, high = number(float(np.min(values)), digits), number(float(np.max(values)), digits)
     return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
 
 

@@ -16,45 +16,36 @@ from typing import Any, BinaryIO
 
 from ._errors import InputError
 
-WORK, LOCK = ".mcc-jax-work-", ".mcc-jax.lock"
-READY, STALE = ".mcc-jax-ready", ".stale.json"
-"""Results that are complete and only have to be moved into place, and the list of files to drop, in that folder."""
+WORK, READY, LOCK = ".mcc-jax-work", ".mcc-jax-ready", ".mcc-jax.lock"
+"""Within the folder of the results: those being written, those that are complete and only have to be moved into place,
+and the file that a run locks."""
+STALE = ".stale.json"  # among those that are ready: the list of files to drop
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_CANNOT_WRITE = (*_FULL, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENOTDIR, errno.ENAMETOOLONG)
+_CANNOT_WRITE = (
+    *_FULL, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG
+)  # fmt: skip
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 @dataclass
 class Stage:
-    """Where a run writes its results before they are moved into place.
+    """Where a run writes its results before they are moved into place."""
 
-    Attributes:
-        directory: the folder of the results.
-        folder: the folder to write into; its files are moved to `directory` at the end, subfolders included.
-        stale: names, relative to `directory`, of files of an earlier run that this one replaces or drops.
-    """
-
-    directory: Path
-    folder: Path
-    stale: list[str] = field(default_factory=list)
+    directory: Path  # of the results
+    folder: Path  # to write into; its files are moved to `directory` at the end, subfolders included
+    stale: list[str] = field(default_factory=list)  # names of files of an earlier run that this one replaces or drops
 
 
 @contextlib.contextmanager
 def results(directory: Path) -> Iterator[Stage]:
     """A stage for results, which are moved into the folder if the body ends well; else the folder stays as it was.
 
-    The folder is locked meanwhile. The stage is renamed when it is complete: a process killed before leaves the old
-    results, and after one that is killed later the next run in this folder moves what is left of the new ones. Only
-    files that the run wrote, or named as stale, are touched. A folder within a stage is written as it is. Raises
-    `InputError` if the folder cannot be written, or another run is writing there.
+    The folder, made with its parents if need be, is locked meanwhile. The stage is renamed when it is complete: a
+    process killed before leaves the old results, and after one that is killed later the next run in this folder moves
+    what is left of the new ones. Only files that the run wrote, or named as stale, are touched.
 
-    Args:
-        directory: the folder, made with its parents if need be.
+    Raises `InputError` if the folder cannot be written, or another run is writing there.
     """
-    if WORK in str(directory):
-        directory.mkdir(parents=True, exist_ok=True)
-        yield Stage(directory, directory)
-        return
     made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     try:
         if directory.exists() and not directory.is_dir():
@@ -63,15 +54,14 @@ def results(directory: Path) -> Iterator[Stage]:
         with _locked(directory):
             _finish(directory)
             # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
-            work = Path(tempfile.mkdtemp(prefix=WORK, dir=directory))
+            stage = Stage(directory, directory / WORK)
+            stage.folder.mkdir()
             try:
-                stage = Stage(directory, work / "new")
-                stage.folder.mkdir()
                 yield stage
                 _complete(stage)
                 _finish(directory)
             finally:
-                shutil.rmtree(work, ignore_errors=True)
+                shutil.rmtree(stage.folder, ignore_errors=True)
     except BaseException as error:
         for folder in made:
             with contextlib.suppress(OSError):
@@ -109,7 +99,7 @@ def _finish(directory: Path) -> None:
                 file.replace(target)
         for name in json.loads((ready / STALE).read_text(encoding="utf-8")):
             (directory / name).unlink(missing_ok=True)
-    for left_over in (ready, *directory.glob(WORK + "*")):
+    for left_over in (ready, directory / WORK):
         shutil.rmtree(left_over, ignore_errors=True)
 
 
@@ -138,18 +128,13 @@ def _locked(directory: Path) -> Iterator[None]:
 
 def _as_input_error(directory: Path, error: BaseException) -> BaseException:
     """The error for the user, who knows the folder but not the stage."""
-    if isinstance(error, InputError) and error.file is not None and WORK in str(error.file):
-        return error.changed(file=directory)
-    if not isinstance(error, OSError) or isinstance(error, InputError):
-        return error
-    # Making the folder can fail at a parent of it, writing at anything inside.
-    place = "" if error.filename is None else str(error.filename)
-    ours = bool(place) and (place.startswith(str(directory)) or str(directory).startswith(place))
-    if not ours and error.errno not in _CANNOT_WRITE:
+    if isinstance(error, InputError):
+        return error.changed(file=directory) if WORK in str(error.file) else error
+    if not isinstance(error, OSError) or error.errno not in _CANNOT_WRITE:
         return error
     why = error.strerror or str(error)
-    if error.errno == errno.EISDIR and place:
-        why = f"{Path(place).name} there is a folder, where a file is to be written"
+    if error.errno == errno.EISDIR:
+        why = f"{Path(str(error.filename)).name} there is a folder, where a file is to be written"
     remedy = "Make room and run again" if error.errno in _FULL else "Give a folder you may write to"
     return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
 

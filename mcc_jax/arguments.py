@@ -1,17 +1,16 @@
 """Values of arguments of public functions: what is obviously meant is converted, what gives wrong numbers is refused.
 
-What is refused raises `InputError`, in one line that names it; an object of a wrong class is left to Python. Only what
-can be looked at is checked: a tracer (inside `jax.jit`, `vmap` or `grad`) passes, so nothing here is part of what is
-compiled; in plain Python a check takes microseconds.
+What is refused raises `InputError`, in one line that names it; an object of a wrong class is left to Python. A tracer
+(inside `jax.jit`, `vmap` or `grad`) passes, so nothing here is part of what is compiled.
 """
 
 from __future__ import annotations
 
 import enum
 import math
-import numbers
 import os
 from collections.abc import Collection, Iterable, Sized
+from numbers import Real
 from pathlib import Path, PurePath
 from typing import Any, cast
 
@@ -80,7 +79,7 @@ def number(
 ) -> float:
     """A number, finite and within bounds, as a Python float: `least` and `most` are allowed, `above` and `below` not.
 
-    It may be of numpy, JAX or pandas, and infinite if that is allowed. The name is for messages, with its unit.
+    It may be of NumPy, JAX or pandas, and infinite if that is allowed. The name is for messages, with its unit.
     """
     bounds = {">=": least, ">": above, "<=": most, "<": below}
     limits = " and ".join(f"{sign} {bound:g}" for sign, bound in bounds.items() if math.isfinite(bound))
@@ -96,12 +95,9 @@ def number(
 
 def whole(value: Any, name: str, *, least: int = 0, most: int | None = None) -> int:
     """A whole number within bounds, as a Python integer: a count, a seed."""
-    upper = "" if most is None else f" and <= {most}"
-    plain = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
-    if not plain and isinstance(value, jax.Array | np.ndarray) and not is_traced(value):
-        plain = value.ndim == 0 and value.dtype.kind in "iu"
-    found = int(value) if plain and math.isfinite(value) else least - 1
+    found = int(value) if is_number(value) and math.isfinite(value) else least - 1
     if found < least or found != value or (most is not None and found > most):
+        upper = "" if most is None else f" and <= {most}"
         raise InputError(f"{name} must be a whole number >= {least}{upper}, got {shown(value)}")
     return found
 
@@ -127,22 +123,21 @@ def _array_of(value: Any) -> np.ndarray | None:
 
 
 def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.ndarray:
-    """Numbers as a numpy array of floating-point numbers: from a list, a Series, an array of any kind.
+    """Numbers as a NumPy array of floating-point numbers: from a list, a Series, an array of any kind.
 
     An array that is one already is handed back itself; tracers are not for this function.
     """
     if isinstance(value, Iterable) and not isinstance(value, str | bytes) and not hasattr(value, "__array__"):
         value = list(value)
-    array = None if isinstance(value, str | bytes | dict | set) else _array_of(value)
-    if array is not None and array.dtype.kind == "f":
+    array = None if isinstance(value, str | bytes) else _array_of(value)
+    if array is None:
+        raise InputError(f"{name} must be {shape}, got {kind_of(value)}")
+    if array.dtype.kind == "f":
         return array
-    if array is not None and array.dtype.kind in "iu":
+    # Objects: a Series of mixed numbers, or nothing at all.
+    if array.dtype.kind in "iu" or (array.dtype.kind == "O" and all(isinstance(x, Real) for x in array.ravel())):
         return array.astype(float)
-    if array is not None and array.size == 0 and array.dtype.kind == "O":
-        return array.astype(float)
-    if array is not None and array.dtype.kind == "O" and all(isinstance(x, numbers.Real) for x in array.ravel()):
-        return array.astype(float)  # a Series of mixed numbers
-    raise InputError(f"{name} must be {shape}, got {kind_of(value) if array is None else shown(value)}")
+    raise InputError(f"{name} must be {shape}, got {shown(value)}")
 
 
 def values(value: Any, name: str, *, shape: str = "a number or an array of numbers") -> jax.Array:
@@ -180,9 +175,8 @@ def same_length(**arrays: Any) -> int:
     (first, one), *others = arrays.items()
     for name, other in others:
         if len(other) != len(one):
-            raise InputError(
-                f"{first} has {len(one)} entries and {name} has {len(other)}", remedy="Give as many of each."
-            )
+            problem = f"{first} has {len(one)} entries and {name} has {len(other)}"
+            raise InputError(problem, remedy="Give as many of each.")
     return len(one)
 
 
@@ -202,11 +196,10 @@ def diameters(value: Any, name: str = "diameters_um") -> np.ndarray:
 def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
     """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite."""
     array = floats(value, name, shape="D1, D2, D3 [um] of one particle")
-    if array.shape != (3,) or not (np.isfinite(array) & (array > 0)).all():
-        raise InputError(
-            f"{name}: a particle has three positive diameters D1, D2, D3 [um], got {shown(array.tolist())}"
-        )
-    return array
+    if array.shape == (3,) and (np.isfinite(array) & (array > 0)).all():
+        return array
+    got = shown(array.tolist())
+    raise InputError(f"{name}: a particle has three positive diameters D1, D2, D3 [um], got {got}")
 
 
 def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) -> None:

@@ -60,7 +60,7 @@ def _killed_once(arguments: list[str], fit: Path, chance: random.Random, usual: 
         if when == "at any moment":
             time.sleep(chance.uniform(0, usual))
         else:
-            pattern = f"{WORK}*/new/*" if when == "while writing" else READY
+            pattern = f"{WORK}/*" if when == "while writing" else READY
             while process.poll() is None and not any(fit.glob(pattern)):
                 pass
             time.sleep(chance.uniform(0, 0.3) if when == "while writing" else chance.uniform(0, 0.002))

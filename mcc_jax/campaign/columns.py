@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
+from .._format import first_few
 
 FORCE, LENGTH, TIME = "force", "length", "time"
 CANONICAL = {FORCE: "mN", LENGTH: "um", TIME: "s"}
@@ -33,13 +34,12 @@ def _registry() -> Any:
 
 @cache
 def unit_factor(unit: str, dimension: str) -> Fraction:
-    """How many canonical units (mN, um, s) one `unit`, letters only, is.
-
-    Raises `ValueError` if the unit is unknown or measures something else; the text says which.
-    """
+    """How many canonical units (mN, um, s) one `unit` is; `ValueError` if it is unknown or measures something else."""
     canonical = CANONICAL[dimension]
     if unit == canonical:
         return Fraction(1)
+    if not unit:
+        raise ValueError("the unit is missing")
     if _UNIT.fullmatch(unit) is None:
         raise ValueError(f"{unit!r} is not a unit")
     registry = _registry()
@@ -58,40 +58,33 @@ def convert(values: np.ndarray, factor: Fraction) -> np.ndarray:
     if factor == 1:
         return values
     with np.errstate(over="ignore"):  # the caller checks the size and names the row
-        if factor.numerator == 1:
-            return values / float(factor.denominator)
-        return values * float(factor)
+        return values / float(factor.denominator) if factor.numerator == 1 else values * float(factor)
 
 
 def find_column(
     header: Sequence[str], quantity: str, dimension: str, file: str | Path, *, what: str = "column"
 ) -> tuple[int, Fraction]:
-    """Where `quantity` is in a header, and the factor that turns its unit into the canonical one.
+    """Where a name such as "force", without its unit, is in a header, and what turns the unit into the canonical one.
 
-    Raises `InputError` if the quantity is missing, appears twice, or has no unit or a wrong one.
-
-    Args:
-        header: the names, already stripped of blanks.
-        quantity: the name without its unit, e.g. "force".
-        dimension: "force", "length" or "time".
-        what: what the names are called in messages.
+    Raises `InputError` if the quantity is missing, appears twice, or has no unit or a wrong one; `what` is what the
+    names are called in its message.
     """
     expected = f"{quantity}_{CANONICAL[dimension]}"
-    allowed = f"accepted units, as a suffix: {EXAMPLES[dimension]} (for example {expected})"
+    units = f"units, as a suffix: {EXAMPLES[dimension]} (for example {expected})"
     found = [i for i, name in enumerate(header) if name.rpartition("_")[0] == quantity]
     if len(found) == 1:
         named = header[found[0]]
         try:
             return found[0], unit_factor(named.rpartition("_")[2], dimension)
         except ValueError as error:
-            problem, remedy = str(error), allowed[0].upper() + allowed[1:]
+            problem, remedy = str(error), f"Accepted {units}"
     elif found:
         problem, named = f"{quantity} is given {len(found)} times", " and ".join(header[i] for i in found)
         remedy = "Keep one of them"
     elif quantity in header:
-        problem, named, remedy = "the unit is missing", quantity, f"Name it {expected}; {allowed}"
+        problem, named, remedy = "the unit is missing", quantity, f"Name it {expected}; accepted {units}"
     else:
-        raise missing_column(header, expected, file, what=what, hint=f"; {allowed}")
+        raise missing_column(header, expected, file, what=what, hint=f"; accepted {units}")
     raise InputError(problem, file=file, row=1 if what == "column" else None, column=named, remedy=remedy)
 
 
@@ -101,7 +94,8 @@ def missing_column(
     """The error for a column that is not there, with the nearest name that is."""
     lower = {name.lower(): name for name in reversed(header)}
     close = get_close_matches(expected.lower(), list(lower), n=1, cutoff=0.6)
-    there = ", ".join(header[:12]) + (", ..." if len(header) > 12 else "")
-    remedy = f"Did you mean {expected!r} by {lower[close[0]]!r}? Rename it" if close else f"Add it; there are: {there}"
+    remedy = f"Add it; there are: {first_few(header, 12)}"
+    if close:
+        remedy = f"Did you mean {expected!r} by {lower[close[0]]!r}? Rename it"
     row = 1 if what == "column" else None
     return InputError(f"the {what} {expected!r} is missing", file=file, row=row, remedy=remedy + hint)

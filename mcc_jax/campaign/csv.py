@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import os
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -13,30 +16,26 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import first_few
 from .._store import results
 from ..files import TABLE_BYTES, open_regular
-from .columns import LENGTH, convert, find_column
-from .curves import PARTICLES, CurveRows, name_column, read_curves
+from .columns import FORCE, LENGTH, TIME, convert, find_column, missing_column
 from .metadata import format_metadata, parse_metadata, read_settings
-from .schema import Campaign
-from .table import Table, decode, make_table, parse_table, read_bytes, read_table
-from .validate import check_campaign, check_magnitudes
+from .schema import CHANNELS, Campaign, Curve
+from .table import Table, decode, make_table, parse_table, read_bytes, read_table, same_text
+from .validate import check_campaign, check_magnitudes, fault_of
 from .workbook import is_workbook, read_sheet
 
-CURVES, METADATA = "curves.csv", "campaign.toml"
+PARTICLES, CURVES, METADATA = "particles.csv", "curves.csv", "campaign.toml"
+_CHANNELS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
+_DIAMETERS = {"D1": LENGTH, "D2": LENGTH, "D3": LENGTH}
 
 
 def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
-    """Read a campaign folder and check all of it.
+    """Read a folder with `particles.csv`, `curves.csv` and perhaps `campaign.toml`, and check all of it.
 
     Lengths become um, forces mN, times s, whatever units the columns are named with. Rows of different particles
     may be mixed; within a particle they must be in the order of time. Particles keep the order of `particles.csv`.
-
-    Args:
-        folder: the folder that holds `particles.csv`, `curves.csv` and perhaps `campaign.toml`.
-
-    Returns:
-        The campaign, with every value finite, every diameter positive and every curve at least two rows long.
 
     Raises:
         InputError: if anything is missing, damaged or contradictory; it names file, row and column.
@@ -45,28 +44,14 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     check_folder(path)
     table = read_table(path / PARTICLES)
     names, diameters, columns = parse_particles(table)
-    curves = read_curves(path / CURVES).named_as(names)
-    _check_match(table, names, curves)
+    curves = _read_curves(path / CURVES, names, table)
     metadata_file = path / METADATA
-    campaign = Campaign(
-        particles=names,
-        diameters_um=diameters,
-        curves=tuple(curves.curve(name) for name in names),
-        columns=columns,
-        metadata=parse_metadata(_metadata_text(metadata_file), metadata_file),
-        source=str(path),
-    )
-    for name, curve in zip(names, campaign.curves, strict=True):
-        curves.check(name, curve)
-    return campaign
+    metadata = parse_metadata(_metadata_text(metadata_file), metadata_file)
+    return Campaign(names, diameters, curves, columns, metadata, source=str(path))
 
 
 def check_folder(path: str | Path) -> None:
-    """Whether a folder has the files of a campaign.
-
-    Raises:
-        InputError: saying what was expected and what is there.
-    """
+    """Whether a folder has the files of a campaign; `InputError` says what was expected and what is there."""
     path = arguments.file_path(path, "path")
     expected = f"a campaign is a folder with {PARTICLES} and {CURVES}"
     try:
@@ -85,7 +70,7 @@ def check_folder(path: str | Path) -> None:
         if name not in there:
             lower = {entry.lower(): entry for entry in there}
             close = get_close_matches(name, list(lower), n=1, cutoff=0.8)
-            found = ", ".join(there[:8]) + (", ..." if len(there) > 8 else "") if there else "nothing"
+            found = first_few(there, 8) or "nothing"
             remedy = f"Expected: {expected} (mcc-jax convert makes one of an instrument file); found: {found}"
             if close:
                 remedy = f"Rename {lower[close[0]]!r} to it"
@@ -95,9 +80,7 @@ def check_folder(path: str | Path) -> None:
 
 
 def _metadata_text(file: Path) -> str:
-    """The text of `campaign.toml`; empty if there is none. What has nearly that name, which nobody would look for, is
-    refused.
-    """
+    """The text of `campaign.toml`; empty if there is none. A file of nearly that name is refused, not ignored."""
     if os.path.lexists(file):
         return read_settings(file)
     for entry in file.parent.iterdir():
@@ -117,16 +100,13 @@ def read_particles(
         file: a text table, or an Excel workbook whose only sheet, or the one called "particles", is the table.
         named: what the column of names may be called.
 
-    Returns:
-        Names, diameters [um] of shape (N, 3), and the further columns as text.
-
-    Raises:
-        InputError: naming file, row and column.
+    Returns names, diameters [um] of shape (N, 3), and the further columns as text; `InputError` names file and row.
     """
     path = arguments.file_path(file, "file")
     data = read_bytes(path)
     if is_workbook(data):
-        return parse_particles(make_table(iter([read_sheet(data, path, preferred=Path(PARTICLES).stem)]), path), named)
+        cells = read_sheet(data, path, preferred=Path(PARTICLES).stem)
+        return parse_particles(make_table(cells, range(1, len(cells) + 1), path), named)
     return parse_particles(parse_table(decode(data, path), path), named)
 
 
@@ -134,46 +114,81 @@ def parse_particles(
     table: Table, named: Sequence[str] = ("particle",)
 ) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
     """Names, diameters [um] and further columns of a table of particles; see `read_particles`."""
-    where = name_column(table.header, table.file, named)
-    names = _checked_names(table.text(where), table)
-    found = [find_column(table.header, quantity, LENGTH, table.file) for quantity in ("D1", "D2", "D3")]
-    used = [column for column, _ in found]
-    table.refuse_groups(used)
-    diameters = []
-    for (column, factor), raw in zip(found, table.numbers(used), strict=True):
-        values = convert(raw, factor)
-        check_magnitudes(values, table.file, table.rows, table.header[column], diameter=True)
-        diameters.append(values)
-    columns = {name: tuple(table.text(i)) for i, name in enumerate(table.header) if i not in (where, *used)}
-    return names, np.stack(diameters, axis=-1), columns
-
-
-def _checked_names(names: Sequence[str], table: Table) -> tuple[str, ...]:
+    where = _name_column(table, named)
+    names = tuple(table.columns[where])
     seen: dict[str, int] = {}
-    for name, row in zip(names, table.rows, strict=True):
+    for i, name in enumerate(names):
         if not name.strip():
-            raise _wrong(table, row, "the name is empty", "Name the particle")
+            raise table.wrong("the name is empty", i, where, "Name the particle")
         if name in seen:
-            problem = f"the particle {name!r} is already in row {seen[name]}"
-            raise _wrong(table, row, problem, "Give every particle one row")
-        seen[name] = row
-    return tuple(names)
+            problem = f"the particle {name!r} is already in row {table.rows[seen[name]]}"
+            raise table.wrong(problem, i, where, "Give every particle one row")
+        seen[name] = i
+    diameters = _measured(table, _DIAMETERS)
+    further = {name: tuple(table.columns[i]) for i, name in enumerate(table.header) if i not in (where, *diameters)}
+    return names, np.stack(list(diameters.values()), axis=-1), further
 
 
-def _wrong(table: Table, row: int, problem: str, remedy: str) -> InputError:
-    return InputError(problem, file=table.file, row=row, column="particle", remedy=remedy)
+def _name_column(table: Table, allowed: Sequence[str] = ("particle",)) -> int:
+    """Which column holds the names; `allowed` are the names that the column itself may have, the usual one first."""
+    for name in allowed:
+        if name in table.header:
+            return table.header.index(name)
+    raise missing_column(table.header, allowed[0], table.file)
 
 
-def _check_match(table: Table, names: tuple[str, ...], curves: CurveRows) -> None:
-    for name, row in zip(names, table.rows, strict=True):
-        if name not in curves.groups:
-            remedy = _similar(name, curves.groups) or f"Add its rows to {CURVES} or remove it here"
-            raise _wrong(table, row, f"the particle {name!r} has no curve in {CURVES}", remedy)
-    known = set(names)
-    for name, records in curves.groups.items():
-        if name not in known:
-            remedy = _similar(name, names) or f"Add its diameters to {PARTICLES} or remove its rows here"
-            raise curves.wrong(f"the particle {name!r} is not in {PARTICLES}", records[0], remedy)
+def _measured(table: Table, quantities: Mapping[str, str]) -> dict[int, np.ndarray]:
+    """The columns of some quantities in mN, um or s, by their place in the table."""
+    found = dict(find_column(table.header, name, dimension, table.file) for name, dimension in quantities.items())
+    if quantities is _DIAMETERS or table.delimiter != ",":
+        table.refuse_groups(list(found))
+    for column, raw in zip(found, table.numbers(list(found)), strict=True):
+        values = convert(raw, found[column])
+        check_magnitudes(values, table.file, table.rows, table.header[column], diameter=quantities is _DIAMETERS)
+        found[column] = values
+    return found
+
+
+def _read_curves(file: Path, particles: Sequence[str], sizes: Table) -> tuple[Curve, ...]:
+    """The tests of the particles, in their order, each of its rows in the file's order."""
+    table = read_table(file, names="particle")
+    where = _name_column(table)
+    channels = _measured(table, _CHANNELS)
+    for i, name in enumerate(table.header):
+        if i != where and i not in channels:
+            remedy = f"Keep particle, time, force and displacement; facts about a particle belong in {PARTICLES}"
+            raise InputError("is no column of curves", file=file, row=1, column=name, remedy=remedy)
+    rows = _rows_of(table, where, particles)
+    for i, name in enumerate(particles):
+        if name not in rows:
+            remedy = _similar(name, rows) or f"Add its rows to {CURVES} or remove it here"
+            problem = f"the particle {name!r} has no curve in {CURVES}"
+            raise InputError(problem, file=sizes.file, row=sizes.rows[i], column="particle", remedy=remedy)
+    for name, records in rows.items():
+        if name not in particles:
+            remedy = _similar(name, particles) or f"Add its diameters to {PARTICLES} or remove its rows here"
+            raise table.wrong(f"the particle {name!r} is not in {PARTICLES}", records[0], where, remedy)
+    curves = tuple(Curve(*(values[rows[name]] for values in channels.values())) for name in particles)
+    for name, curve in zip(particles, curves, strict=True):
+        if (fault := fault_of(name, curve)) is not None:
+            column = dict(zip(_CHANNELS, channels, strict=True)).get(fault.channel, where)
+            raise table.wrong(fault.problem, rows[name][fault.reading], column, fault.remedy)
+    return curves
+
+
+def _rows_of(table: Table, where: int, particles: Sequence[str]) -> dict[str, list[int]]:
+    """The records of each particle, also where a name differs from that of the particle in its Unicode form only."""
+    groups: defaultdict[str, list[int]] = defaultdict(list)
+    for record, name in enumerate(table.columns[where]):
+        groups[name].append(record)
+    form = {same_text(name): name for name in reversed(particles)} | {name: name for name in particles}
+    found: defaultdict[str, list[int]] = defaultdict(list)
+    for name, records in groups.items():
+        if not name.strip():
+            raise table.wrong("the name is empty", records[0], where, "Name the particle")
+        known = form.get(name, form.get(same_text(name), name))
+        found[known] = sorted(found[known] + records)
+    return found
 
 
 def _similar(name: str, others: Iterable[str]) -> str | None:
@@ -184,62 +199,58 @@ def _similar(name: str, others: Iterable[str]) -> str | None:
 def file_checksums(folder: str | Path) -> dict[str, str]:
     """SHA-256 of `particles.csv`, `curves.csv` and `campaign.toml`, by name; of those that are there.
 
-    Raises:
-        InputError: if a file cannot be read.
+    Raises `InputError` if a file cannot be read.
     """
     path = arguments.file_path(folder, "folder")
     found = {}
     for name in (PARTICLES, CURVES, METADATA):
-        file = path / name
-        if not os.path.lexists(file):
-            continue
-        with open_regular(file, TABLE_BYTES, "Split the campaign into several folders") as stream:
-            found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+        if os.path.lexists(path / name):
+            with open_regular(path / name, TABLE_BYTES, "Split the campaign into several folders") as stream:
+                found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
     return found
 
 
 def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:
     """Write a campaign so that `read_campaign` gives back exactly the same numbers and texts.
 
-    The three files appear in `folder` together or not at all; other files there are left alone.
-
-    Args:
-        campaign: what to write; it is checked first.
-        folder: the folder to make or to replace the campaign in.
-
-    Raises:
-        InputError: if the campaign could not be read back, or the folder cannot be written.
+    The three files appear in `folder`, which is made if need be, together or not at all; other files there are left
+    alone. Raises `InputError` if the campaign could not be read back, or the folder cannot be written.
     """
     path = arguments.file_path(folder, "folder")
-    check_campaign(campaign, file=path)
-    texts = {
-        PARTICLES: _format_particles(campaign),
-        CURVES: _format_curves(campaign),
-        METADATA: format_metadata(campaign.metadata, path / METADATA),
-    }
+    texts = _texts(campaign, path)
     with results(path) as stage:
         for name, text in texts.items():
-            (stage.folder / name).write_bytes(text.encode("utf-8"))
+            (stage.folder / name).write_bytes(text)
 
 
-def _cell(text: str) -> str:
-    if any(mark in text for mark in ',"\r\n'):
-        return '"' + text.replace('"', '""') + '"'
-    return text
+def write_files(campaign: Campaign, folder: Path) -> None:
+    """The same, one file after the other, for a folder that is itself part of a stage."""
+    texts = _texts(campaign, folder)
+    folder.mkdir(exist_ok=True)
+    for name, text in texts.items():
+        (folder / name).write_bytes(text)
 
 
-def _format_particles(campaign: Campaign) -> str:
-    lines = [",".join(["particle", "D1_um", "D2_um", "D3_um", *map(_cell, campaign.columns)])]
-    further = list(campaign.columns.values())
-    for i, (name, diameters) in enumerate(zip(campaign.particles, campaign.diameters_um.tolist(), strict=True)):
-        lines.append(",".join([_cell(name), *map(repr, diameters), *(_cell(values[i]) for values in further)]))
-    return "\n".join(lines) + "\n"
-
-
-def _format_curves(campaign: Campaign) -> str:
-    lines = ["particle,time_s,force_mN,displacement_um"]
+def _texts(campaign: Campaign, folder: Path) -> dict[str, bytes]:
+    """The contents of the three files, by name."""
+    check_campaign(campaign, file=folder)
+    sizes = zip(campaign.particles, *campaign.diameters_um.T.tolist(), *campaign.columns.values(), strict=True)
+    header = ["particle", "D1_um", "D2_um", "D3_um", *campaign.columns]
+    curves = [f"particle,{','.join(CHANNELS)}"]
     for name, curve in zip(campaign.particles, campaign.curves, strict=True):
-        cell = _cell(name)
-        columns = (np.asarray(c, float).tolist() for c in (curve.time_s, curve.force_mN, curve.displacement_um))
-        lines.extend(f"{cell},{t!r},{f!r},{d!r}" for t, f, d in zip(*columns, strict=True))
-    return "\n".join(lines) + "\n"
+        cell = _row([name])
+        columns = (np.asarray(getattr(curve, channel), float).tolist() for channel in CHANNELS)
+        curves.extend(f"{cell},{t!r},{f!r},{d!r}" for t, f, d in zip(*columns, strict=True))
+    texts = {
+        PARTICLES: "\n".join([_row(header), *map(_row, sizes)]) + "\n",
+        CURVES: "\n".join(curves) + "\n",
+        METADATA: format_metadata(campaign.metadata, folder / METADATA),
+    }
+    return {name: text.encode("utf-8") for name, text in texts.items()}
+
+
+def _row(cells: Iterable[object]) -> str:
+    """Cells with commas between them, quoted where that is needed, numbers with all their digits."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="").writerow(cells)
+    return text.getvalue()

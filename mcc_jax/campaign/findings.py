@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from .._format import described
+from .._format import described, first_few
 
 Level = Literal["info", "warning", "error"]
 
@@ -71,8 +71,7 @@ def named(names: tuple[str, ...], of: int, most: int = 5) -> str:
     """Particles by their names, as the beginning of a sentence; of many the first ones and how many there are."""
     if len(names) == 1:
         return f"Particle {names[0]}"
-    shown = ", ".join(names[:most])
-    return f"Particles {shown}" if len(names) <= most else f"Particles {shown}, ... ({len(names)} of {of})"
+    return f"Particles {first_few(names, most)}" + (f" ({len(names)} of {of})" if len(names) > most else "")
 
 
 def joined(each: Mapping[str, Iterable[Finding]]) -> tuple[Finding, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import math
@@ -18,7 +19,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..files import SETTINGS_BYTES, read_regular
-from .columns import FORCE, LENGTH, convert, find_column
+from .columns import CANONICAL, FORCE, LENGTH, convert, find_column
 from .schema import Control, Metadata
 from .table import decode
 
@@ -35,39 +36,38 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
     """Parse TOML; the line with a mistake is named."""
     try:
         entries = tomllib.loads(text)
-        long = _long_integer(entries)
+        _refuse_long_integers(entries, file)
     except RecursionError:
         raise InputError("is nested too deep", file=file, remedy="Write flat keys") from None
+    except InputError:
+        raise
     except ValueError as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
         row = int(place[1]) if place else text.rstrip().count("\n") + 1
         remedy = 'Write key = value lines, text in double quotes, for example control = "load"'
         raise InputError(f"this is not TOML: {problem}", file=file, row=row, remedy=remedy) from None
-    if long is not None:
-        problem = "holds an integer of more than 64 bits"
-        raise InputError(problem, file=file, column=long, remedy="Write it with a decimal point")
     return entries
 
 
-def _long_integer(value: Any, key: str = "") -> str | None:
-    """The key of an integer that no float may hold, if there is one; TOML promises 64 bits only."""
-    if isinstance(value, int):
-        return None if -(2**63) <= value < 2**63 else key
-    inside = value.items() if isinstance(value, dict) else [("", v) for v in value] if isinstance(value, list) else ()
-    return next((long for name, v in inside if (long := _long_integer(v, key or name)) is not None), None)
+def _refuse_long_integers(value: Any, file: Path, key: str = "") -> None:
+    """TOML promises integers of 64 bits only; a float may not hold a longer one."""
+    if isinstance(value, dict):
+        for name, one in value.items():
+            _refuse_long_integers(one, file, name)
+    elif isinstance(value, list):
+        for one in value:
+            _refuse_long_integers(one, file, key)
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        problem = "holds an integer of more than 64 bits"
+        raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
 
 
 def typed[T](entries: Mapping[str, Any], kind: type[T], file: Path, write: Mapping[str, str]) -> T:
-    """Entries of a TOML file as a `msgspec.Struct`.
+    """Entries of a TOML file as a `msgspec.Struct` that forbids unknown fields.
 
-    Raises `InputError` naming the key that is unknown, missing or of another type.
-
-    Args:
-        entries: what the file holds.
-        kind: the type, a `Struct` that forbids unknown fields.
-        file: the file, for messages.
-        write: what to write for a key, by its last part.
+    Raises `InputError` naming the key that is unknown, missing or of another type. `write` holds what to write for a
+    key, by its last part.
     """
     try:
         return msgspec.convert(entries, kind)
@@ -96,14 +96,9 @@ def typed[T](entries: Mapping[str, Any], kind: type[T], file: Path, write: Mappi
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
-    """Read a TOML file; an empty one holds no entries.
+    """The entries of a TOML file; an empty one has none.
 
-    Args:
-        path: the file.
-        what: what it should be, for the message, for example "a TOML file of priors".
-
-    Raises:
-        InputError: if it cannot be read, is no UTF-8 text, or is not TOML.
+    Raises `InputError` if it cannot be read, is no UTF-8 text, or is not TOML. `what` is what it should be, in words.
     """
     file = arguments.file_path(path, "path")
     try:
@@ -132,70 +127,54 @@ def parse_metadata(text: str, file: Path) -> Metadata:
         if key.lower() != key and key.lower() in (*_WRITE, *_QUANTITIES):
             raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {key.lower()!r}?")
     known = typed({key: entries.pop(key) for key in _WRITE if key in entries}, _Known, file, _WRITE)
-    return Metadata(
-        control=known.control,
-        force_resolution_mN=_positive(entries, "force_resolution", file),
-        displacement_resolution_um=_positive(entries, "displacement_resolution", file),
-        punch_diameter_um=_positive(entries, "punch_diameter", file),
-        provenance=known.provenance,
-        corrections=known.corrections,
-        other=entries,
-    )
+    sizes = {
+        f"{quantity}_{CANONICAL[dimension]}": _positive(entries, quantity, dimension, file)
+        for quantity, dimension in _QUANTITIES.items()
+    }
+    return Metadata(known.control, **sizes, provenance=known.provenance, corrections=known.corrections, other=entries)
 
 
-def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | None:
+def _positive(entries: dict[str, Any], quantity: str, dimension: str, file: Path) -> float | None:
+    """The number of a key whose name ends in its unit; None, if there is none."""
     keys = list(entries)
-    if not any(key == quantity or key.rpartition("_")[0] == quantity for key in keys):
+    if not any(quantity in (key, key.rpartition("_")[0]) for key in keys):
         return None
-    where, factor = find_column(keys, quantity, _QUANTITIES[quantity], file, what="key")
-    key = keys[where]
-    value = entries.pop(key)
+    where, factor = find_column(keys, quantity, dimension, file, what="key")
+    value = entries.pop(keys[where])
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     number = float(convert(np.array([float(value)]), factor)[0]) if plain else math.nan
     if not 0 < number < math.inf:
         remedy = "Write the number alone, without quotes and unit, or remove the key"
-        raise InputError(f"{str(value)[:40]!r} is not a positive number", file=file, column=key, remedy=remedy)
+        raise InputError(f"{str(value)[:40]!r} is not a positive number", file=file, column=keys[where], remedy=remedy)
     return number
 
 
 def format_metadata(metadata: Metadata, file: Path) -> str:
-    """The text of a `campaign.toml` that reads back as the same metadata.
-
-    Raises `InputError` if `other` holds what TOML cannot, or a key that has a meaning of its own.
-    """
-    known = {
-        "control": metadata.control,
-        "force_resolution_mN": metadata.force_resolution_mN,
-        "displacement_resolution_um": metadata.displacement_resolution_um,
-        "punch_diameter_um": metadata.punch_diameter_um,
-        "provenance": metadata.provenance,
-        "corrections": list(metadata.corrections) or None,
-    }
-    for key in metadata.other:
+    """The text of a `campaign.toml`; `InputError` if it would not read back as the same metadata."""
+    known = {field.name: getattr(metadata, field.name) for field in dataclasses.fields(metadata)}
+    other = known.pop("other")
+    for key in other:
         if not isinstance(key, str) or key in known:
-            raise InputError(f"{key!r} cannot be a key of its own", file=file, remedy="Rename it in Metadata.other")
-    entries = {key: value for key, value in known.items() if value is not None}
+            raise InputError(f"{key!r} cannot be a further key", file=file, remedy="Rename it in Metadata.other")
     try:
-        text = _table({**entries, **metadata.other})
+        text = _table({key: value for key, value in known.items() if value not in (None, ())} | other)
         text.encode("utf-8")
     except (TypeError, ValueError) as error:
         problem = f"cannot be written as TOML: {error}"
         raise InputError(problem, file=file, remedy="Keep text, numbers, dates, lists and tables") from None
     # Texts are compared, since a number may be none (NaN), which equals nothing.
-    if _table(parse_metadata(text, file).other) != _table(metadata.other):
+    if _table(parse_metadata(text, file).other) != _table(other):
         raise InputError("would not read back the same", file=file, remedy="Rename the keys of Metadata.other")
     return text
 
 
 def _table(entries: Mapping[str, Any]) -> str:
     """Entries as TOML: tables behind all others."""
-    plain = [f"{_key(key)} = {_value(value)}\n" for key, value in entries.items() if not isinstance(value, Mapping)]
-    tables = [
-        "".join([f"\n[{_key(key)}]\n", *(f"{_key(k)} = {_value(v)}\n" for k, v in table.items())])
-        for key, table in entries.items()
-        if isinstance(table, Mapping)
-    ]
-    return "".join(plain + tables)
+    tables = {key: value for key, value in entries.items() if isinstance(value, Mapping)}
+    lines = [f"{_key(key)} = {_value(value)}\n" for key, value in entries.items() if key not in tables]
+    for key, table in tables.items():
+        lines += [f"\n[{_key(key)}]\n", *(f"{_key(k)} = {_value(v)}\n" for k, v in table.items())]
+    return "".join(lines)
 
 
 def _key(key: Any) -> str:

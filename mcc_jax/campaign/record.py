@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
@@ -38,9 +39,10 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
 def record_columns(
     curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
 ) -> dict[str, np.ndarray]:
-    """The record of a measured test as arrays of NumPy by name, to be put together with others; see `record_of`."""
+    """The record of a measured test as NumPy arrays by name, to be put together with others; see `record_of`."""
+    humidity = REFERENCE_HUMIDITY_PERCENT
     if relative_humidity_percent is not None:
-        arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
+        humidity = arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
     count = len(curve)
     if not segments or segments[0].start != 0 or segments[-1].stop != count:
         raise InputError(f"the segments must cover all {count} points of the curve")
@@ -85,7 +87,6 @@ def record_columns(
         for name, values in zip(names, zip(*states, strict=True), strict=True)
     }
     columns |= {"rate": rates, "loading_rate": loading_rates}
-    humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
     return {"force": force, "time": time, **columns, "relative_humidity": np.asarray(humidity, dtype=float)}
 
 
@@ -125,20 +126,19 @@ def humidity_column(
     particles: Sequence[str], columns: Mapping[str, Sequence[str]], source: str = ""
 ) -> Float[np.ndarray, " particles"] | None:
     """The same from a table of particles alone; see `humidities`."""
-    texts = columns.get(HUMIDITY_COLUMN)
-    if texts is None:
+    if HUMIDITY_COLUMN not in columns:
         return None
-    values = np.empty(len(texts))
-    for i, text in enumerate(texts):
+    values = []
+    for name, text in zip(particles, columns[HUMIDITY_COLUMN], strict=True):
         try:
-            values[i] = float(text)
+            values.append(float(text))
         except ValueError:
-            values[i] = np.nan
-        if not 0 <= values[i] <= 100:
-            problem = f"the relative humidity of particle {particles[i]!r} is {text!r}"
+            values.append(math.nan)
+        if not 0 <= values[-1] <= 100:
+            problem = f"the relative humidity of particle {name!r} is {text!r}"
             remedy = "Write a number from 0 to 100, in percent"
             raise InputError(problem, file=source or None, column=HUMIDITY_COLUMN, remedy=remedy)
-    return values
+    return np.array(values)
 
 
 def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], before: float) -> Float[np.ndarray, " n"]:

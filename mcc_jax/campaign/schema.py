@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from itertools import compress
 from pathlib import PurePath
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -14,7 +15,11 @@ from .._errors import InputError
 from .._format import described, number, span, table
 from .findings import Finding
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 Control = Literal["load", "displacement"]
+CHANNELS = ("time_s", "force_mN", "displacement_um")
 
 
 def remembered[T](of: Curve | Campaign, question: Hashable, find: Callable[[], T]) -> T:
@@ -65,9 +70,8 @@ class Curve:
         displacement_um: relative displacement of the two platens [um], shape (n,).
         checked: what `check_tests` changed, of a curve that it made; None of a raw one.
 
-    Lists, Series and arrays of any kind become numpy arrays that cannot be written to.
-
-    Anything else, or columns of different lengths, raises `InputError`.
+    Lists, Series and arrays of any kind become NumPy arrays that cannot be written to; anything else, or columns of
+    different lengths, raises `InputError`.
     """
 
     time_s: np.ndarray
@@ -76,13 +80,12 @@ class Curve:
     checked: Checked | None
 
     def __init__(self, time_s: Any, force_mN: Any, displacement_um: Any, checked: Checked | None = None) -> None:
-        given = {"time_s": time_s, "force_mN": force_mN, "displacement_um": displacement_um}
-        for name, column in given.items():
+        for name, column in zip(CHANNELS, (time_s, force_mN, displacement_um), strict=True):
             values = arguments.floats(column, name, shape="a 1-D array of numbers")
             if values.ndim != 1:
                 raise InputError(f"the {name} of a curve has the shape {values.shape} where a 1-D array is expected")
             object.__setattr__(self, name, _fixed(values))
-        arguments.same_length(time_s=self.time_s, force_mN=self.force_mN, displacement_um=self.displacement_um)
+        arguments.same_length(**{name: getattr(self, name) for name in CHANNELS})
         object.__setattr__(self, "checked", checked)
 
     def __len__(self) -> int:
@@ -91,8 +94,7 @@ class Curve:
     def __repr__(self) -> str:
         if not len(self):
             return "Curve without readings"
-        force, path = span([self.force_mN.min(), self.force_mN.max()], "mN"), self.displacement_um
-        return f"Curve of {len(self)} readings, {force}, {span([path.min(), path.max()], 'um')}"
+        return f"Curve of {len(self)} readings, {span(self.force_mN, 'mN')}, {span(self.displacement_um, 'um')}"
 
     @property
     def compared(self) -> np.ndarray:
@@ -153,7 +155,8 @@ class Campaign:
         source: the folder or file it was read from, for messages; empty when made in memory.
         raw: of a campaign that `check_tests` made, the one it was made from; None otherwise.
 
-    Lists and Series are converted; wrong kinds or different lengths raise `InputError`.
+    `campaign["P3"]` is the test of that particle, a `Curve`, and a loop over a campaign gives its tests in order. Lists
+    and Series are converted; wrong kinds or different lengths raise `InputError`.
     """
 
     particles: tuple[str, ...]
@@ -176,7 +179,7 @@ class Campaign:
     ) -> None:
         names = _texts(particles, "particles")
         sizes = arguments.floats(diameters_um, "diameters_um", shape=_SIZES)
-        sizes = sizes.reshape(0, 3) if sizes.size == 0 else sizes
+        sizes = sizes if sizes.size else sizes.reshape(0, 3)
         if sizes.shape != (len(names), 3):
             raise InputError(f"diameters_um has the shape {sizes.shape} where ({len(names)}, 3) is expected: {_SIZES}")
         tests = tuple(curves)
@@ -184,13 +187,21 @@ class Campaign:
         further = {name: _texts(cells, f"the column {name!r}") for name, cells in (columns or {}).items()}
         for name, cells in further.items():
             arguments.same_length(**{"particles": names, f"the column {name!r}": cells})
-        fields = {"particles": names, "diameters_um": _fixed(sizes), "curves": tests, "columns": further}
-        fields |= {"metadata": metadata or Metadata(), "source": str(source), "raw": raw}
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+        values = (names, _fixed(sizes), tests, further, metadata or Metadata(), str(source), raw)
+        for entry, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, entry.name, value)
 
     def __len__(self) -> int:
         return len(self.particles)
+
+    def __iter__(self) -> Iterator[Curve]:
+        return iter(self.curves)
+
+    def __contains__(self, particle: object) -> bool:
+        return particle in self.particles
+
+    def __getitem__(self, particle: str) -> Curve:
+        return self.curves[self.index(particle)]
 
     def __repr__(self) -> str:
         title = f"Campaign of {len(self)} particles" + (f" from {self.source}" if self.source else "")
@@ -204,20 +215,30 @@ class Campaign:
         """Position of a particle by its name; `InputError` if there is none."""
         if particle in self.particles:
             return self.particles.index(particle)
-        known = ", ".join(self.particles)
-        raise InputError(f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}.")
+        remedy = f"There are: {', '.join(self.particles)}."
+        raise InputError(f"there is no particle {arguments.shown(particle)}", remedy=remedy)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """All readings as a table with the columns of `curves.csv`, one row each.
+
+        They are `particle`, `time_s`, `force_mN` and `displacement_um`.
+        """
+        import pandas as pd
+
+        lengths = [len(curve) for curve in self.curves]
+        columns = {name: np.concatenate([getattr(curve, name) for curve in self.curves]) for name in CHANNELS}
+        return pd.DataFrame({"particle": np.repeat(np.array(self.particles, object), lengths), **columns})
 
     def select(self, keep: np.ndarray) -> Campaign:
         """The campaign of those particles where `keep`, booleans of shape (N,), is true."""
         keep = np.asarray(keep)
         if keep.dtype != bool or keep.shape != (len(self),):
             raise InputError(f"keep must be {len(self)} booleans, one for every particle, got {arguments.shown(keep)}")
-        chosen = np.flatnonzero(keep)
         return Campaign(
-            tuple(self.particles[i] for i in chosen),
-            self.diameters_um[chosen],
-            tuple(self.curves[i] for i in chosen),
-            {name: tuple(values[i] for i in chosen) for name, values in self.columns.items()},
+            compress(self.particles, keep),
+            self.diameters_um[keep],
+            compress(self.curves, keep),
+            {name: list(compress(values, keep)) for name, values in self.columns.items()},
             self.metadata,
             self.source,
             None if self.raw is None else self.raw.select(keep),

@@ -18,9 +18,8 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from .schema import Control, Curve, remembered
+from .schema import CHANNELS, Control, Curve, remembered
 from .signal import branch_envelope, median, noise_level, steady_clock, stretches, turning_points, two_lines
-from .validate import check_finite
 
 CONTACT = 0.01  # share of the range of force up to which the beginning may count as approach
 BEGINS_LOADED = 0.05
@@ -223,8 +222,10 @@ def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
     """The segments of a curve, see `find_segments`."""
     if not len(curve):
         raise InputError("the curve has no point", remedy="Give a test with two points or more.")
-    for name in ("time_s", "force_mN", "displacement_um"):
-        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
+    for name in CHANNELS:
+        bad = np.flatnonzero(~np.isfinite(getattr(curve, name)))
+        if bad.size:
+            raise InputError(f"the {name} of a curve is {getattr(curve, name)[bad[0]]} at sample {bad[0] + 1}")
     clock = steady_clock(np.asarray(curve.time_s, float))
     drive = Drive(curve.force_mN, clock)
     if not drive.moves:

@@ -1,4 +1,4 @@
-"""Text tables: the one tokeniser, the one number parser, and errors that name the row as an editor counts it.
+"""Text tables: cells, numbers, and errors that name the row as an editor counts it.
 
 Columns are separated by commas or, as spreadsheets of many countries write, by semicolons or tabs. Numbers may have a
 decimal comma, between quotes where commas separate the columns, as long as it cannot be a thousands separator. A
@@ -7,20 +7,18 @@ delimiter after the last cell of a row, and rows of delimiters only, hold nothin
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, islice
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 
 from .._errors import InputError
@@ -28,7 +26,7 @@ from ..files import TABLE_BYTES, read_regular
 from .columns import LARGEST_MAGNITUDE
 
 SPACES = " \u00a0\u2007\u2009\u202f"
-"""Blank, no-break, figure, thin and narrow no-break space: nobody sees which of them parts the thousands."""
+"""Blank, no-break, figure, thin and narrow no-break space: nobody sees which of them separates the thousands."""
 APOSTROPHES = "'\u2019"
 _MAGIC = {
     b"\x1f\x8b": "gzip-compressed",
@@ -46,7 +44,7 @@ _MAGIC = {
 
 
 def binary_kind(data: bytes) -> str | None:
-    """What a file that is not text is, in words; None for text."""
+    """What a file that is not text is, in words."""
     for magic, kind in _MAGIC.items():
         if data.startswith(magic):
             return kind
@@ -56,10 +54,7 @@ def binary_kind(data: bytes) -> str | None:
 
 
 def read_bytes(file: Path) -> bytes:
-    """The bytes of a table or an instrument's export.
-
-    Raises `InputError` if it cannot be read, is empty or too large; see `mcc_jax.files`.
-    """
+    """The bytes of a table or an instrument's export; `InputError` if there are none, or too many."""
     data = read_regular(file, TABLE_BYTES, "Split it into several, or thin its readings")
     if not data.strip(b" \t\r\n\xef\xbb\xbf"):
         raise InputError("the file is empty", file=file, remedy="Export it again")
@@ -82,77 +77,14 @@ def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> 
 
 
 def same_text(text: str) -> str:
-    """A name in the one form (Unicode NFC) in which names are compared: an accent may be a character of its own."""
+    """A name in the one form (Unicode NFC) in which names are compared: an accent may be a separate character."""
     return unicodedata.normalize("NFC", text)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table: names and cells of the columns, the row of the file at which each record starts, and the delimiter.
+# ---- numbers ---------------------------------------------------------------------------------------------------------
 
-    Cells are text; columns that were asked for as numbers, and can be nothing else, are numbers already.
-    """
-
-    file: Path
-    header: tuple[str, ...]
-    columns: Sequence[Sequence[str] | np.ndarray]
-    rows: Sequence[int]
-    delimiter: str = ","
-
-    def text(self, column: int) -> Sequence[str]:
-        """The cells of a column, as they are."""
-        cells = self.columns[column]
-        assert not isinstance(cells, np.ndarray)
-        return cells
-
-    def decimal_mark(self, columns: Sequence[int]) -> str:
-        """The decimal mark of some columns: a comma if one appears in them and is no thousands separator.
-
-        Spreadsheets separate columns by semicolons where the comma is the decimal mark, so there it always is. With
-        tabs, or commas and quotes, 1,500 is either: then a comma counts if no point appears in the columns and some
-        cell, such as 1,5, has other than three digits behind it.
-        """
-        texts = ["\n".join(self.text(i)) for i in columns]
-        if not any("," in text for text in texts):
-            return "."
-        if self.delimiter == ";":
-            return ","
-        commas = (cell.strip() for i in columns for cell in self.text(i) if "," in cell)
-        either = any("." in text for text in texts) or all(_one_group(",").fullmatch(cell) for cell in commas)
-        return "." if either else ","
-
-    def refuse_groups(self, columns: Sequence[int]) -> None:
-        """Refuse numbers whose decimal mark looks like a thousands separator; columns of a unit are judged together."""
-        mark = self.decimal_mark(columns)
-        units: dict[str, list[int]] = {}
-        for column in columns:
-            units.setdefault(self.header[column].rpartition("_")[2], []).append(column)
-        for alike in units.values():
-            cells = (pair for column in alike for pair in enumerate(self.text(column)))
-            if (found := thousands_for_decimals(cells, mark)) is not None:
-                k, problem = found
-                column = next(c for c in alike if mark in self.text(c)[k])
-                remedy = "Write numbers without marks between the thousands, or all with as many decimals"
-                raise InputError(problem, file=self.file, row=self.rows[k], column=self.header[column], remedy=remedy)
-
-    def numbers(self, columns: Sequence[int]) -> list[np.ndarray]:
-        """The cells of some columns as finite numbers, all with one decimal mark; the first that is none is named."""
-        found = [self.columns[i] for i in columns]
-        if all(isinstance(each, np.ndarray) for each in found):
-            return found  # type: ignore[return-value]
-        mark = self.decimal_mark(columns)
-        return [_column(self.text(i), mark, self.file, self.rows, self.header[i]) for i in columns]
-
-
-def _column(cells: Sequence[str], mark: str, file: Path, rows: Sequence[int], name: str) -> np.ndarray:
-    try:
-        return numbers(cells, mark)
-    except NotANumber as error:
-        point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
-        if thousands_mark(cells[error.index], mark):
-            point += " and no mark between the thousands"
-        remedy, row = f"Write a number with {point}, or remove the row", rows[error.index]
-        raise InputError(str(error), file=file, row=row, column=name, remedy=remedy) from None
+_LARGEST_NUMBER = LARGEST_MAGNITUDE * 1e12
+"""In any unit."""
 
 
 class NotANumber(ValueError):
@@ -163,122 +95,53 @@ class NotANumber(ValueError):
         self.index = index
 
 
-_AT_ONCE = 2**14
-"""Cells parsed together: more would only need more memory."""
-_PLAIN = msgspec.json.Decoder(list[float])
-
-
 def numbers(cells: Sequence[str], decimal_mark: str = ".") -> np.ndarray:
-    """The numbers of a column's cells, shape (n,), each rounded correctly.
-
-    Raises `NotANumber` at the first cell that `parse_number` refuses.
-    """
-    found = np.empty(len(cells))
-    for start in range(0, len(cells), _AT_ONCE):
-        some = cells[start : start + _AT_ONCE]
-        values = _plain_numbers(some, decimal_mark)
-        for i, cell in enumerate(some if values is None else ()):
-            try:
-                found[start + i] = parse_number(cell, decimal_mark)
-            except ValueError as error:
-                raise NotANumber(str(error), start + i) from None
-        if values is not None:
-            found[start : start + len(some)] = values
-    return found
-
-
-def _plain_numbers(cells: Sequence[str], decimal_mark: str) -> np.ndarray | None:
-    """The same by a parser of JSON, ten times as fast; None unless every cell is a number as JSON writes them."""
+    """The numbers of a column's cells, shape (n,); `NotANumber` at the first cell that `parse_number` refuses."""
     text = "\n".join(cells)
-    if decimal_mark != ".":
-        if "." in text:
-            return None
-        text = text.replace(decimal_mark, ".")
-    try:
-        values = np.array(_PLAIN.decode(f"[{text.replace('\n', ',')}]"))
-    except msgspec.MsgspecError:
-        return None
-    if len(values) != len(cells) or not (np.abs(values) <= _LARGEST_NUMBER).all():
-        return None
-    for i in np.flatnonzero(values == 0).tolist():  # JSON knows no negative zero without a decimal point
-        values[i] = parse_number(cells[i], decimal_mark)
-    return values
-
-
-_LARGEST_NUMBER = LARGEST_MAGNITUDE * 1e12
-"""In any unit."""
+    if text.isascii() and "_" not in text and (decimal_mark == "." or "." not in text):
+        with contextlib.suppress(ValueError):  # several times as fast where all cells are plain
+            values = np.array([float(cell.replace(decimal_mark, ".")) for cell in cells])
+            if (np.abs(values) <= _LARGEST_NUMBER).all():
+                return values
+    found = []
+    for i, cell in enumerate(cells):
+        try:
+            found.append(parse_number(cell, decimal_mark))
+        except ValueError as error:
+            raise NotANumber(str(error), i) from None
+    return np.array(found)
 
 
 def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> float:
-    """A cell's number.
-
-    Args:
-        cell: the text.
-        decimal_mark: "." or ",".
-        thousands: characters each of which may stand between groups of three digits; none if empty.
+    """A cell's number; `thousands` are characters each of which may separate groups of three digits.
 
     Raises `ValueError` if the cell is empty, text, not finite, or too large; the text says which.
     """
-    stripped = cell.strip()
-    if not stripped:
+    text = cell.strip()
+    if not text:
         raise ValueError("the cell is empty")
-    plain = stripped if decimal_mark == "." else stripped.replace(decimal_mark, ".")
-    shown = stripped if len(stripped) <= 40 else stripped[:40] + "..."
-    foreign = decimal_mark != "." and "." in stripped
-    if thousands and any(mark in stripped for mark in thousands):
-        grouped = _grouped(thousands, decimal_mark).fullmatch(stripped)
-        if grouped is None:
-            raise ValueError(f"{shown!r} is not a number with groups of three digits")
-        plain = re.sub(f"[{re.escape(thousands)}]", "", stripped).replace(decimal_mark, ".")
-        foreign = False
+    shown = repr(text if len(text) <= 40 else f"{text[:40]}...")
+    plain = text
+    if any(mark in text for mark in thousands):
+        if _grouped(thousands, decimal_mark).fullmatch(text) is None:
+            raise ValueError(f"{shown} is not a number with groups of three digits")
+        plain = re.sub(f"[{re.escape(thousands)}]", "", text)
+    # Python also reads 1_000 and digits of other scripts; in a data file both are mistakes.
+    odd = not plain.isascii() or "_" in plain or (decimal_mark != "." and "." in plain)
     try:
-        # Python also reads 1_000 and digits of other scripts; in a data file both are mistakes.
-        number = float(plain) if plain.isascii() and "_" not in plain else None
+        number = None if odd else float(plain.replace(decimal_mark, "."))
     except ValueError:
         number = None
-    if number is None or foreign:
-        hint = " (a decimal comma?)" if decimal_mark == "." and stripped.count(",") == 1 else ""
-        if thousands_mark(stripped, decimal_mark):
-            hint = " (a mark between the thousands?)" if not hint or "." in stripped else hint
-        raise ValueError(f"{shown!r} is not a number{hint}")
+    if number is None:
+        hint = " (a decimal comma?)" if decimal_mark == "." and text.count(",") == 1 else ""
+        if thousands_mark(text, decimal_mark) and (not hint or "." in text):
+            hint = " (a mark between the thousands?)"
+        raise ValueError(f"{shown} is not a number{hint}")
     if math.isnan(number) or (math.isinf(number) and "n" in plain.lower()):
-        raise ValueError(f"{shown!r} is not a finite number")
+        raise ValueError(f"{shown} is not a finite number")
     if abs(number) > _LARGEST_NUMBER:
-        raise ValueError(f"{shown!r} is too large to be a measurement")
+        raise ValueError(f"{shown} is too large to be a measurement")
     return number
-
-
-def thousands_for_decimals(cells: Iterable[tuple[int, str]], mark: str) -> tuple[int, str] | None:
-    """Where a decimal mark may be one between thousands, so that readings would be a thousandth of what they are.
-
-    So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
-    every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
-    number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
-
-    Args:
-        cells: row and text of each.
-        mark: the decimal mark.
-
-    Returns:
-        The row of the first such cell and what is wrong with it; None if nothing is.
-    """
-    grouped: tuple[int, str] | None = None
-    whole: str | None = None
-    for row, text in cells:
-        cell = text.strip()
-        if mark in cell:
-            if not _one_group(mark).fullmatch(cell):
-                return None
-            grouped = grouped or (row, cell)
-        elif whole is None and _WHOLE.fullmatch(cell):
-            whole = cell
-    if grouped is None or whole is None:
-        return None
-    row, cell = grouped
-    return row, f"{cell!r} next to {whole!r} looks like a mark between thousands, not a decimal mark"
-
-
-_WHOLE = re.compile(r"[-+]?[1-9][0-9]{2,}")
 
 
 @cache
@@ -294,25 +157,103 @@ def _grouped(thousands: str, decimal_mark: str) -> re.Pattern[str]:
 
 def thousands_mark(cell: str, decimal_mark: str = ".") -> str | None:
     """The mark between groups of three digits in a cell that is no number without it; None if there is none."""
-    for mark in (".", ",", *APOSTROPHES, *SPACES):
-        if mark != decimal_mark and _grouped(mark, decimal_mark).fullmatch(cell.strip()):
-            return mark
-    return None
+    marks = (".", ",", *APOSTROPHES, *SPACES)
+    return next((m for m in marks if m != decimal_mark and _grouped(m, decimal_mark).fullmatch(cell.strip())), None)
 
 
-def _header(cells: list[str], file: Path) -> tuple[str, ...]:
-    """Names of the columns, without blanks around them; none may be empty or stand there twice."""
-    if len(cells) == 1 and "|" in cells[0]:
-        problem = "the columns are separated by '|'"
-        raise InputError(problem, file=file, row=1, remedy="Use commas, semicolons or tabs instead")
-    header = tuple(cell.strip().strip("\ufeff").strip() for cell in cells)
-    for i, name in enumerate(header):
-        if not name:
-            raise InputError(f"the name of column {i + 1} is empty", file=file, row=1, remedy="Name or delete it")
-    name, count = Counter(header).most_common(1)[0]
-    if count > 1:
-        raise InputError(f"column appears {count} times", file=file, row=1, column=name, remedy="Rename or delete one")
-    return header
+def thousands_for_decimals(cells: Sequence[str], mark: str) -> tuple[int, str] | None:
+    """The index of a cell whose decimal mark may be one between thousands, and what is wrong with it.
+
+    So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
+    every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
+    number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
+    """
+    grouped: int | None = None
+    whole: str | None = None
+    for i, text in enumerate(cells):
+        cell = text.strip()
+        if mark in cell:
+            if _one_group(mark).fullmatch(cell) is None:
+                return None
+            grouped = i if grouped is None else grouped
+        elif whole is None and re.fullmatch(r"[-+]?[1-9][0-9]{2,}", cell):
+            whole = cell
+    if grouped is None or whole is None:
+        return None
+    return (
+        grouped,
+        f"{cells[grouped].strip()!r} next to {whole!r} looks like a mark between thousands, not a decimal mark",
+    )
+
+
+# ---- tables ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: names of the columns, their cells as text or, where they are plain, numbers, and each record's row."""
+
+    file: Path
+    header: tuple[str, ...]
+    columns: Sequence[Sequence[str] | np.ndarray]
+    rows: Sequence[int]
+    delimiter: str = ","
+
+    def wrong(self, problem: str, record: int | np.integer, column: int, remedy: str) -> InputError:
+        """The error for a cell."""
+        row = self.rows[int(record)]
+        return InputError(problem, file=self.file, row=row, column=self.header[column], remedy=remedy)
+
+    def decimal_mark(self, columns: Sequence[int]) -> str:
+        """The decimal mark of some columns: a comma if one appears in them and is no thousands separator.
+
+        Spreadsheets separate columns by semicolons where the comma is the decimal mark. With tabs, or commas and
+        quotes, 1,500 is either: then a comma counts if there is no point in the columns and some cell, such as 1,5, has
+        other than three digits behind it.
+        """
+        texts = ["\n".join(self.columns[i]) for i in columns]
+        if not any("," in text for text in texts):
+            return "."
+        if self.delimiter == ";":
+            return ","
+        commas = (cell.strip() for i in columns for cell in self.columns[i] if "," in cell)
+        either = any("." in text for text in texts) or all(_one_group(",").fullmatch(cell) for cell in commas)
+        return "." if either else ","
+
+    def refuse_groups(self, columns: Sequence[int]) -> None:
+        """Refuse numbers whose decimal mark looks like a thousands separator; columns of a unit are judged together."""
+        mark = self.decimal_mark(columns)
+        units: dict[str, list[int]] = {}
+        for column in columns:
+            units.setdefault(self.header[column].rpartition("_")[2], []).append(column)
+        for alike in units.values():
+            found = thousands_for_decimals([cell for column in alike for cell in self.columns[column]], mark)
+            if found is not None:
+                place, record = divmod(found[0], len(self.rows))
+                remedy = "Write numbers without marks between the thousands, or all with as many decimals"
+                raise self.wrong(found[1], record, alike[place], remedy)
+
+    def numbers(self, columns: Sequence[int], mark: str | None = None, remedy: str | None = None) -> list[np.ndarray]:
+        """The cells of some columns as finite numbers, all with one decimal mark; the first that is none is named."""
+        if all(isinstance(self.columns[i], np.ndarray) for i in columns):
+            return [self.columns[i] for i in columns]  # type: ignore[misc]
+        mark = self.decimal_mark(columns) if mark is None else mark
+        return [self._numbers(i, mark, remedy) for i in columns]
+
+    def _numbers(self, column: int, mark: str, remedy: str | None) -> np.ndarray:
+        try:
+            return numbers(self.columns[column], mark)  # type: ignore[arg-type]
+        except NotANumber as error:
+            point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
+            if thousands_mark(self.columns[column][error.index], mark):
+                point += " and no mark between the thousands"
+            remedy = remedy or f"Write a number with {point}, or remove the row"
+            raise self.wrong(str(error), error.index, column, remedy) from None
+
+
+def filled(cells: Sequence[str]) -> int:
+    """The number of cells up to the last one that holds something."""
+    return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
 
 
 def number_of_cells(count: int) -> str:
@@ -320,50 +261,44 @@ def number_of_cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-Batch = tuple[Sequence[int], list[list[str]]]
-"""Numbers of rows, and their cells."""
-Numeric = Callable[[tuple[str, ...]], Sequence[int]]
-"""Which columns of a header hold numbers."""
+def make_table(records: Sequence[list[str]], rows: Sequence[int], file: Path, delimiter: str = ",") -> Table:
+    """A table from the cells of its records, the header first, and the row in which each begins.
 
-
-def make_table(batches: Iterator[Batch], file: Path, delimiter: str = ",", numeric: Numeric | None = None) -> Table:
-    """A table from rows that are already split; rows whose cells are all empty are skipped.
-
-    Empty cells behind the last column that has a name hold nothing and are dropped. Raises `InputError` if a row has
-    another number of cells than the header, or there are no rows.
-
-    Args:
-        batches: numbers of rows and their cells, the header first.
-        delimiter: what separates the columns.
-        numeric: columns whose cells are numbers with a decimal point, to be parsed as they come.
+    Records whose cells are all empty are skipped; empty cells behind the last column that has a name are dropped.
+    Raises `InputError` if a record has another number of cells than the header, or there is none below it.
     """
-    full = (batch for batch in map(_without_empty, batches) if batch[0])
-    first, body = next(full, ((), []))
-    if not first:
+    full = [i for i, cells in enumerate(records) if (cells and cells[0].strip()) or filled(cells)]
+    if not full:
         raise InputError("the file is empty", file=file, remedy="Export it again")
-    names = body[0]
+    names = records[full[0]]
     header = _header(names[: filled(names)], file)
-    wanted = numeric(header) if numeric else ()
-    columns: list[list[Any]] = [[] for _ in header]
-    rows: list[int] = []
-    for places, records in chain([(first[1:], body[1:])], full):
-        if {*map(len, records)} != {len(header)}:
-            records = [_fit(cells, row, names, file, delimiter) for row, cells in zip(places, records, strict=True)]
-        rows.extend(places)
-        for i, cells in enumerate(zip(*records, strict=True)):
-            columns[i].append(_column(cells, ".", file, places, header[i]) if i in wanted else cells)
-    if not rows:
+    body = [records[i] for i in full[1:]]
+    rows = [rows[i] for i in full[1:]]
+    if not body:
         raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
-    done = [np.concatenate(parts) if i in wanted else [*chain(*parts)] for i, parts in enumerate(columns)]
-    return Table(file, header, done, rows, delimiter)
+    if {*map(len, body)} != {len(header)}:
+        body = [_fit(cells, row, names, file, delimiter) for cells, row in zip(body, rows, strict=True)]
+    return Table(file, header, list(zip(*body, strict=True)), rows, delimiter)
 
 
-def _without_empty(batch: Batch) -> Batch:
-    """The rows that hold something."""
-    if all(cells and cells[0].strip() for cells in batch[1]):
-        return batch
-    full = [(row, cells) for row, cells in zip(*batch, strict=True) if filled(cells)]
-    return [row for row, _ in full], [cells for _, cells in full]
+def check_header(header: Sequence[str], file: Path, row: int | None, remedy: str) -> None:
+    """Refuse a name that appears twice."""
+    for name, count in Counter(header).most_common(1):
+        if count > 1:
+            raise InputError(f"column appears {count} times", file=file, row=row, column=name, remedy=remedy)
+
+
+def _header(cells: list[str], file: Path) -> tuple[str, ...]:
+    """Names of the columns, without blanks around them; none may be empty or appear twice."""
+    if len(cells) == 1 and "|" in cells[0]:
+        problem = "the columns are separated by '|'"
+        raise InputError(problem, file=file, row=1, remedy="Use commas, semicolons or tabs instead")
+    header = tuple(cell.strip().strip("\ufeff").strip() for cell in cells)
+    for i, name in enumerate(header):
+        if not name:
+            raise InputError(f"the name of column {i + 1} is empty", file=file, row=1, remedy="Name or delete it")
+    check_header(header, file, 1, "Rename or delete one")
+    return header
 
 
 def _fit(cells: list[str], row: int, names: list[str], file: Path, delimiter: str) -> list[str]:
@@ -381,59 +316,62 @@ def _fit(cells: list[str], row: int, names: list[str], file: Path, delimiter: st
     raise InputError(problem, file=file, row=row, column=column, remedy=remedy)
 
 
+def split(text: str, file: Path, delimiter: str) -> tuple[list[list[str]], Sequence[int]]:
+    """The cells of every record of a text, and the line in which each begins.
+
+    Quoted cells may hold delimiters and line breaks. Raises `InputError` where quotes do not close.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=delimiter)
+    records: list[list[str]] = []
+    lines = [1]  # in which each record begins, and the next one
+    try:
+        for record in reader:
+            records.append(record)
+            lines.append(reader.line_num + 1)
+    except csv.Error as error:
+        problem = f"quotes or cells are damaged ({error})"
+        raise InputError(problem, file=file, row=lines[-1], remedy="Close every double quote") from None
+    return records, lines[:-1]
+
+
 _SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*(?:\r\n|\r|\n)', re.IGNORECASE)
-
-
 _FIRST_LINE = re.compile(r"\s*[^\r\n]*")
 
 
-def filled(cells: list[str]) -> int:
-    """The number of cells up to the last one that holds something."""
-    return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
+def read_table(file: Path, names: str = "") -> Table:
+    """A table of a file; if a column of `names` is given, the others are numbers, parsed at once if all are plain."""
+    text = decode(read_bytes(file), file)
+    return (plain_table(text, file, names) if names else None) or parse_table(text, file)
 
 
-def split(text: str, file: Path, delimiter: str, first: int = 1) -> Iterator[Batch]:
-    """The rows of a text, many at once: the number of the line at which each begins, and its cells.
+def plain_table(text: str, file: Path, names: str) -> Table | None:
+    """A table of names and plain numbers, read by pandas, which is several times as fast; None if it is another."""
+    import pandas as pd
 
-    Quoted cells may hold delimiters and line breaks. Raises `InputError` where quotes do not close.
-
-    Args:
-        delimiter: what separates the columns.
-        first: the number of the row at which the table begins; nothing above it is read.
-    """
-    lines = io.StringIO(text, newline="")
-    for _ in range(1, first):
-        lines.readline()
-    reader = csv.reader(lines, strict=True, delimiter=delimiter)
-    row = first
-    # A quoted cell may go over several lines; then only the line at which the next row begins is known.
-    at_once = 1 if '"' in text else _AT_ONCE
-    try:
-        while records := list(islice(reader, at_once)):
-            yield range(row, row + len(records)), records
-            row = first + reader.line_num
-    except csv.Error as error:
-        problem = f"quotes or cells are damaged ({error})"
-        raise InputError(problem, file=file, row=row, remedy="Close every double quote") from None
+    head, _, body = text.rstrip("\r\n").partition("\n")
+    cells = head.rstrip("\r").split(",")
+    if '"' in text or names not in cells or filled(cells) < len(cells):
+        return None
+    header = _header(cells, file)
+    types = {name: object if name == names else float for name in header}
+    try:  # without the filter of missing values, cells that are empty or too few are errors
+        frame = pd.read_csv(io.BytesIO(text.encode()), header=0, names=header, dtype=types, na_filter=False)
+    except ValueError:
+        return None
+    columns = [frame[name].tolist() if name == names else frame[name].to_numpy() for name in header]
+    # An index: there were more cells than names. Other lines: some were empty, or lines end otherwise.
+    whole = isinstance(frame.index, pd.RangeIndex) and len(frame) == body.count("\n") + 1
+    if whole and all((np.abs(column) <= _LARGEST_NUMBER).all() for column in columns if not isinstance(column, list)):
+        return Table(file, header, columns, range(2, len(frame) + 2))
+    return None
 
 
-def read_table(file: Path, numeric: Numeric | None = None) -> Table:
-    """Read and split a table; see `read_bytes`, `decode` and `parse_table` for what is refused."""
-    return parse_table(decode(read_bytes(file), file), file, numeric)
-
-
-def parse_table(text: str, file: Path, numeric: Numeric | None = None) -> Table:
-    """The whole of a table; rows that are wholly empty are skipped.
-
-    Raises `InputError` if quotes do not close, a row has another number of cells than the header, or there are no rows.
-
-    Args:
-        numeric: columns that hold numbers; they are parsed at once where nothing but a point can be the decimal mark.
-    """
+def parse_table(text: str, file: Path) -> Table:
+    """A whole table of text; its delimiter is the commonest in the header, or the one that its first line names."""
     named = _SEPARATOR.match(text)  # a line by which a spreadsheet program learns the delimiter
-    # Else the commonest of those that separate columns, outside of quotes, in the header.
+    # Else the commonest of those that separate columns, outside of quotes, in the first line that is not blank.
     header = re.sub('"[^"]*"', "", _FIRST_LINE.match(text)[0])  # type: ignore[index]  # it matches every text
     delimiter = named[1] if named is not None else max(",;\t", key=header.count)
-    if delimiter != "," or '"' in text:
-        numeric = None
-    return make_table(split(text, file, delimiter, 1 if named is None else 2), file, delimiter, numeric)
+    records, rows = split(text, file, delimiter)
+    skipped = 0 if named is None else 1
+    return make_table(records[skipped:], rows[skipped:], file, delimiter)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from .columns import LARGEST_MAGNITUDE
 from .schema import Campaign, Curve, Metadata, remembered
 
 SMALLEST_DIAMETER_UM = 1e-6
-_TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
 
 
 def check_magnitudes(
@@ -23,7 +22,7 @@ def check_magnitudes(
 ) -> None:
     """Refuse values that are too large to be measured, and diameters that are not positive, at the first of them.
 
-    `values` are in canonical units, shape (n,); `rows` says in which row of the file each stands.
+    `values` are in canonical units, shape (n,); `rows` are the rows of the file that they are from.
     """
     bad = ~(np.abs(values) <= LARGEST_MAGNITUDE)
     if diameter:
@@ -38,16 +37,43 @@ def check_magnitudes(
     raise InputError(problem, file=file, row=rows[i], column=column, remedy=remedy)
 
 
+class Fault(NamedTuple):
+    """Why no test can be as it is, and the first reading and the channel concerned; that is empty for all of them."""
+
+    problem: str
+    remedy: str
+    reading: int = 0
+    channel: str = ""
+
+
+def fault_of(name: str, curve: Curve) -> Fault | None:
+    """What is wrong with a test whatever its particle is: readings that are no numbers, or too few, times, zeros."""
+    channels = {"time": curve.time_s, "force": curve.force_mN, "displacement": curve.displacement_um}
+    for channel, values in channels.items():
+        bad = np.flatnonzero(~(np.abs(values) <= LARGEST_MAGNITUDE))
+        if bad.size:
+            remedy = "Leave that sample out, or check the unit if all are so large"
+            return Fault(f"the {channel} of test {name!r} is {values[bad[0]]}", remedy, int(bad[0]), channel)
+    if len(curve) < 2:
+        remedy = "A curve needs at least two rows; add them or remove the particle"
+        return Fault(f"the test {name!r} has one row only", remedy)
+    back = np.flatnonzero(np.diff(curve.time_s) < 0)
+    if back.size:
+        i = int(back[0])
+        problem = f"the time of test {name!r} goes back, from {curve.time_s[i]:.10g} s to {curve.time_s[i + 1]:.10g} s"
+        return Fault(problem, "Keep the rows of a test in the order of time; two tests need two names", i + 1, "time")
+    for channel in ("force", "displacement"):
+        if not channels[channel].any():
+            problem = f"every {channel} of test {name!r} is zero, so it holds no data"
+            return Fault(problem, "Export the test again or remove the particle", 0, channel)
+    return None
+
+
 def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = "") -> Campaign:
     """The campaign, if it is one that could have come from files: checked as strictly as one that did.
 
-    Args:
-        campaign: what a function was given.
-        name: what the function calls it, for messages.
-        file: what messages name as the place; where the campaign was read, if empty.
-
-    Raises:
-        InputError: if names, shapes or values are unfit; for a path, how to read it.
+    Raises `InputError` if names, shapes or values are unfit, naming `file` or the place where the campaign was read;
+    given a path, it shows how to read it.
     """
     if isinstance(campaign, str | PurePath):
         remedy = f"Read it first: mcc_jax.read_campaign({str(campaign)!r})."
@@ -57,8 +83,6 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
 
 
 def _check(campaign: Campaign, place: str | Path) -> None:
-    """Refuse unfit names, shapes and values."""
-
     def fail(problem: str, remedy: str = "Correct the campaign before it is used") -> InputError:
         return InputError(problem, file=place, remedy=remedy)
 
@@ -67,22 +91,20 @@ def _check(campaign: Campaign, place: str | Path) -> None:
     name, times = Counter(campaign.particles).most_common(1)[0]
     if times > 1:
         raise fail(f"the particle {name!r} appears {times} times")
-    for name, triple in zip(campaign.particles, campaign.diameters_um, strict=True):
+    for name, triple, curve in zip(campaign.particles, campaign.diameters_um, campaign.curves, strict=True):
         _check_text(name, f"the particle's name {name!r}", fail)
         if not name.strip():
             raise fail("a particle's name is empty")
         if not ((triple >= SMALLEST_DIAMETER_UM) & (triple <= LARGEST_MAGNITUDE)).all():
             raise fail(f"the diameters {triple.tolist()} um of particle {name!r} are not all positive and finite")
-    for name, curve in zip(campaign.particles, campaign.curves, strict=True):
-        _check_curve(name, curve, fail)
+        if (fault := fault_of(name, curve)) is not None:
+            raise fail(f"{fault.problem} (sample {fault.reading + 1})", fault.remedy)
     for column, cells in campaign.columns.items():
-        if not column or column != column.strip() or "\ufeff" in column or column in _TAKEN or column[:3] in _DIAMETER:
+        taken = column == "particle" or column.startswith(("D1_", "D2_", "D3_"))
+        if taken or not column or column != column.strip() or "\ufeff" in column:
             raise fail(f"{column!r} cannot be the name of a further column")
         for text in (column, *cells):
             _check_text(text, f"the text {text!r} of column {column!r}", fail)
-
-
-_DIAMETER = ("D1_", "D2_", "D3_")
 
 
 def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None:
@@ -92,27 +114,6 @@ def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None
         raise fail(f"{what} is no valid Unicode text") from None
     if "\0" in text:
         raise fail(f"{what} holds a NUL character")
-
-
-def check_finite(values: np.ndarray, what: str, fail: Callable[..., InputError]) -> None:
-    """Refuse readings that are not finite, or too large to be measured; `fail` makes the error."""
-    bad = np.flatnonzero(~(np.abs(values) <= LARGEST_MAGNITUDE))
-    if bad.size:
-        remedy = "Leave that sample out, or check the unit if all are so large"
-        raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy=remedy)
-
-
-def _check_curve(name: str, curve: Curve, fail: Callable[..., InputError]) -> None:
-    parts = {"time": curve.time_s, "force": curve.force_mN, "displacement": curve.displacement_um}
-    for what, values in parts.items():
-        check_finite(values, f"the {what} of particle {name!r}", fail)
-        if what != "time" and not values.any():
-            raise fail(f"every {what} of particle {name!r} is zero, so the test holds no data")
-    if len(curve) < 2:
-        raise fail(f"the particle {name!r} has one row only; a curve needs at least two")
-    back = np.flatnonzero(np.diff(parts["time"]) < 0)
-    if len(back):
-        raise fail(f"the time of particle {name!r} goes back at sample {int(back[0]) + 2}")
 
 
 _ALIKE = ("control", "punch_diameter_um", "corrections")
@@ -137,12 +138,11 @@ def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
         problem = f"the particle {twice[0]!r} is in another of the campaigns, too"
         remedy = "Give every particle its own name"
         raise InputError(problem, file=at.source or None, column="particle", remedy=remedy)
-    joined = {name: tuple(v for c in campaigns for v in c.columns[name]) for name in first.columns}
     return Campaign(
-        tuple(names),
+        names,
         np.concatenate([campaign.diameters_um for campaign in campaigns]),
-        tuple(curve for campaign in campaigns for curve in campaign.curves),
-        joined,
+        [curve for campaign in campaigns for curve in campaign.curves],
+        {name: [cell for c in campaigns for cell in c.columns[name]] for name in first.columns},
         _metadata([campaign.metadata for campaign in campaigns]),
         ", ".join(dict.fromkeys(campaign.source for campaign in campaigns if campaign.source)),
     )
@@ -163,10 +163,9 @@ def _check_alike(first: Campaign, other: Campaign) -> None:
 
 
 def _metadata(each: list[Metadata]) -> Metadata:
-    coarsest = {}
-    for name in _COARSEST:
-        known = [value for m in each if (value := getattr(m, name)) is not None]
-        coarsest[name] = max(known, default=None)
+    coarsest = {
+        name: max((value for m in each if (value := getattr(m, name)) is not None), default=None) for name in _COARSEST
+    }
     sources = dict.fromkeys(m.provenance for m in each if m.provenance)
     other = {name: value for m in reversed(each) for name, value in m.other.items()}
     return replace(each[0], **coarsest, provenance="; ".join(sources) or None, other=other)

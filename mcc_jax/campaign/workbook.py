@@ -34,8 +34,8 @@ def read_sheet(
     preferred: str | None = None,
     decimal_mark: str = ".",
     how: str = "",
-) -> tuple[range, list[list[str]]]:
-    """The rows of a sheet: their numbers and their cells as text, numbers with all their digits.
+) -> list[list[str]]:
+    """The cells of all rows of a sheet as text, numbers with all their digits.
 
     Raises `InputError` if it is damaged or too large, the sheet is not clear, or calamine is not installed.
 
@@ -61,30 +61,25 @@ def read_sheet(
         if isinstance(error, KeyboardInterrupt | SystemExit | MemoryError):
             raise
         raise InputError("the workbook is damaged", file=file, remedy=_REMEDY) from None
-    wanted = _choose([str(name) for name in frames], sheet, preferred, file)
-    held = {name: frame for name, frame in frames.items() if frame.size and wanted in (None, name)}
+    names = list(frames)
+    wanted = preferred if sheet is None and preferred in names else sheet
+    if isinstance(sheet, int) and sheet <= len(names):
+        wanted = names[sheet - 1]
+    if wanted is not None and wanted not in names:
+        what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
+        remedy = f"The sheets are: {', '.join(map(repr, names))}"
+        raise InputError(f"there is no {what}", file=file, remedy=remedy)
+    held = [name for name, frame in frames.items() if frame.size and wanted in (None, name)]
     if not held:
         where = f"the sheet {wanted!r}" if wanted is not None else "every sheet"
         raise InputError(f"{where} is empty", file=file, remedy="Save the workbook again with the table in it")
     if len(held) > 1:
-        listed = ", ".join(map(repr, held))
         remedy = how or f"Call the sheet with the table {preferred!r}, or save it alone"
-        raise InputError(f"{len(held)} sheets hold something: {listed}", file=file, remedy=remedy)
-    (frame,) = held.values()
+        problem = f"{len(held)} sheets hold something: {', '.join(map(repr, held))}"
+        raise InputError(problem, file=file, remedy=remedy)
 
     def text(value: Any) -> str:
         return repr(value).replace(".", decimal_mark) if isinstance(value, float) else str(value)
 
-    rows = frame.itertuples(index=False, name=None)
-    return range(1, len(frame) + 1), [[text(value) for value in row] for row in rows]
-
-
-def _choose(names: list[str], sheet: str | int | None, preferred: str | None, file: Path) -> str | None:
-    if sheet is None:
-        return preferred if preferred in names else None
-    if isinstance(sheet, int) and sheet <= len(names):
-        return names[sheet - 1]
-    if sheet in names:
-        return str(sheet)
-    what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
-    raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
+    rows = frames[held[0]].itertuples(index=False, name=None)
+    return [[text(value) for value in row] for row in rows]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-from .._store import results
 from . import options as common
 from .session import say, say_next, session
 
@@ -86,8 +85,7 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: tuple[Path, .
         progress("finding the segments")
         segments = Counter(part.kind for curve in campaign.curves for part in find_segments(curve))
         progress("writing")
-        with results(out) as stage:
-            write_campaign(campaign, stage.folder)
+        write_campaign(campaign, out)
     points = sum(len(curve) for curve in campaign.curves)
     source = (campaign.metadata.provenance or "").partition(";")[0]
     say(f"{len(campaign)} test{'s' if len(campaign) > 1 else ''}, {points} points ({source}).")

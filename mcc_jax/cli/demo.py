@@ -105,13 +105,13 @@ def _job(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Simulate, calibrate, discover, report; the contents of the two results."""
     from ..calibrate import sample
-    from ..campaign import write_campaign
+    from ..campaign.csv import write_files
     from ..discovery import discover
     from ..report import read_results, report_page
 
     progress("simulating the campaign")
     campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
-    write_campaign(campaign, stage.folder / "campaign")
+    write_files(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, folder="campaign")
     written: dict[str, Any] = {"origin": origin, "figures": True, "progress": progress}
     content = write_calibration(sample(campaign, seed=seed, progress=progress), stage, **written)

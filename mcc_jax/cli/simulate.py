@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from .._errors import InputError
-from .._store import results
 from . import options as common
 from .session import say, say_next, session
 
@@ -121,10 +120,9 @@ def simulate(out: Path, **options: Any) -> None:
         laws, programme = _laws(options, sizes), _programme(options)
         peaks = _peaks(options, programme, laws, sizes)
         _check_size(programme, peaks, options["programme"])
-        with results(out) as stage:
-            campaign = _campaign(laws, sizes, peaks, programme, options, hidden)
-            progress("writing")
-            write_campaign(campaign, stage.folder)
+        campaign = _campaign(laws, sizes, peaks, programme, options, hidden)
+        progress("writing")
+        write_campaign(campaign, out)
     points = sum(len(curve) for curve in campaign.curves)
     forces = [curve.force_mN.max() for curve in campaign.curves]
     longest = max(float(curve.time_s[-1]) for curve in campaign.curves)

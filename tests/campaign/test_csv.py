@@ -113,7 +113,6 @@ DIAMETERS = "particle,D1_um,D2_um,D3_um\n"
 BAD = {
     "particles empty": (P, "", ["empty", "Export"]),
     "curves empty": (C, "", ["empty", "Export"]),
-    "curves blank": (C, " \n\n", ["empty"]),
     "particles header only": (P, DIAMETERS, ["row 1", "no row of data"]),
     "curves header only": (C, HEAD, ["row 1", "no row of data"]),
     "particle column missing": (
@@ -121,23 +120,14 @@ BAD = {
         CURVES.replace("particle,", "sample,"),
         ["row 1", "'particle' is missing", "Add it"],
     ),
-    "particle column misspelt": (
-        P,
-        PARTICLES.replace("particle,", "Particle,"),
-        ["Did you mean 'particle' by 'Particle'"],
-    ),
     "diameter missing": (P, "particle,D1_um,D2_um\nA,1,1\n01,1,1\n", ["'D3_um' is missing"]),
-    "diameter misspelt": (P, PARTICLES.replace("D3_um", "d3_um"), ["Did you mean 'D3_um' by 'd3_um'"]),
     "force missing": (C, "particle,time_s,displacement_um\nA,0,0\n", ["'force_mN' is missing"]),
     "force misspelt": (C, CURVES.replace("force_mN", "forse_mN"), ["Did you mean 'force_mN' by 'forse_mN'"]),
-    "force wrong case": (C, CURVES.replace("force_mN", "Force_mN"), ["Did you mean 'force_mN' by 'Force_mN'"]),
     "unit missing": (C, CURVES.replace("force_mN", "force"), ["column 'force'", "unit is missing", "force_mN"]),
-    "unit missing time": (C, CURVES.replace("time_s", "time"), ["column 'time'", "unit is missing", "ms"]),
     "unit unknown": (C, CURVES.replace("force_mN", "force_bananas"), ["'force_bananas'", "unknown", "mN, N, uN"]),
     "unit of other kind": (C, CURVES.replace("force_mN", "force_um"), ["'force_um'", "no unit of force", "mN"]),
-    "unit of mass": (C, CURVES.replace("force_mN", "force_g"), ["'force_g'", "no unit of force", "gf"]),
     "unit an expression": (C, CURVES.replace("force_mN", "force_N*2"), ["'force_N*2'", "not a unit"]),
-    "unit empty": (C, CURVES.replace("force_mN", "force_"), ["'force_'", "not a unit"]),
+    "unit empty": (C, CURVES.replace("force_mN", "force_"), ["'force_'", "unit is missing"]),
     "force twice": (C, "particle,time_s,force_mN,force_N,displacement_um\nA,0,0,0,0\n", ["given 2 times", "Keep one"]),
     "same name twice": (C, "particle,time_s,time_s,force_mN,displacement_um\n", ["'time_s'", "2 times", "Rename"]),
     "name of column empty": (P, PARTICLES.replace("batch", " "), ["column 5 is empty", "Name or delete"]),
@@ -159,34 +149,22 @@ BAD = {
     "NA": (C, CURVES.replace("2.5", "NA"), ["row 3", "'force_mN'", "not a number"]),
     "infinite": (C, CURVES.replace("2.5", "-inf"), ["row 3", "'force_mN'", "not a finite number"]),
     "empty cell": (C, CURVES.replace("2.5", ""), ["row 3", "'force_mN'", "empty"]),
-    "blank cell": (C, CURVES.replace("2.5", "  "), ["row 3", "'force_mN'", "empty"]),
-    "NaN diameter": (P, PARTICLES.replace("190", "NaN"), ["row 2", "'D2_um'", "not a finite number"]),
-    "number overflows": (C, CURVES.replace("2.5", "1e999"), ["row 3", "'force_mN'", "too large"]),
     "number huge": (C, CURVES.replace("2.5", "1e200"), ["row 3", "'force_mN'", "too large"]),
     "number huge in its unit": (C, CURVES.replace("2.5", "1e14").replace("mN", "N"), ["row 3", "too large", "unit"]),
     "diameter negative": (P, PARTICLES.replace("140", "-140"), ["row 3", "'D2_um'", "not positive"]),
-    "diameter zero": (P, PARTICLES.replace("140", "0"), ["row 3", "'D2_um'", "not positive"]),
     "diameter tiny": (P, PARTICLES.replace("140", "1e-300"), ["row 3", "'D2_um'", "too small", "unit"]),
     "particle twice": (P, PARTICLES.replace("01,", "A,"), ["row 3", "'A' is already in row 2", "one row"]),
     "particle without curve": (P, PARTICLES + "B,1,1,1,\n", ["row 4", "'B' has no curve", "remove it"]),
     "curve without particle": (C, CURVES + "B,0,0,0\nB,1,1,1\n", ["row 8", "'B' is not in particles.csv", "Add its"]),
     "blank before a name": (P, PARTICLES.replace("\n01", "\n 01"), ["row 3", "' 01' has no curve", "'01'", "blanks"]),
     "name empty": (P, PARTICLES.replace("01,", ","), ["row 3", "'particle'", "name is empty"]),
-    "name empty in curves": (C, CURVES + ",0,0,0\n", ["row 8", "'particle'", "name is empty"]),
     "time goes back": (C, CURVES.replace("A,2,", "A,0.5,"), ["row 4", "'time_s'", "goes back", "order of time"]),
     "one row": (C, HEAD + "A,0,0,0\nA,1,1,1\n01,0,1,1\n", ["row 4", "'01' has one row only", "two rows"]),
     "too many cells": (C, CURVES.replace("A,2,5,0.2", "A,2,5,0.2,7"), ["row 4", "5 cells", "header has 4"]),
     "too few cells": (C, CURVES.replace("A,2,5,0.2", "A,2,5"), ["row 4", "'displacement_um'", "3 cells", "Fill"]),
     "quotes open": (C, CURVES.replace("A,2", '"A,2'), ["row 4", "quotes", "Close"]),
-    "quotes with a tail": (C, CURVES.replace("A,2", '"A"b,2'), ["row 4", "quotes"]),
     "bars between columns": (C, CURVES.replace(",", "|"), ["row 1", "'|'", "Use commas"]),
     "thousands": (P, PARTICLES.replace("200", '"1,200.5"'), ["row 2", "'D1_um'", "between the thousands"]),
-    "two decimal marks": (
-        P,
-        PARTICLES.replace(",", ";").replace("190", "190,5").replace("140", "140.5"),
-        ["row 3", "'D2_um'", "decimal comma"],
-    ),
-    "semicolons and a cell too many": (P, PARTICLES.replace(",", ";").replace(";x", ";x;y"), ["row 2", "6 cells"]),
     "Latin-1": (P, PARTICLES.replace("A,", "\xb5,").encode("latin-1"), ["row 2", "0xb5", "UTF-8"]),
     "Latin-1 behind a mark": (
         P,
@@ -196,28 +174,21 @@ BAD = {
     "UTF-16": (C, CURVES.encode("utf-16"), ["UTF-16", "UTF-8"]),
     "gzip": (C, b"\x1f\x8b\x08\x00junk", ["gzip", "plain CSV"]),
     "Excel": (C, b"PK\x03\x04junk", ["Excel", "plain CSV"]),
-    "old Excel": (P, b"\xd0\xcf\x11\xe0junk", ["Excel", "plain CSV"]),
     "NUL bytes": (C, CURVES.replace("A", "\0"), ["NUL", "plain CSV"]),
     "forces all zero": (C, HEAD + "A,0,0,0\nA,1,0,1\n01,0,1,1\n01,1,1,1\n", ["row 2", "'force_mN'", "holds no data"]),
     "displacements all zero": (C, HEAD + "A,0,1,0\nA,1,0,0\n01,0,1,1\n01,1,1,1\n", ["'displacement_um'", "no data"]),
     "TOML broken": (T, 'control = "load"\nx = = 1\n', ["row 2", "not TOML", "double quotes"]),
-    "TOML cut off": (T, 'control = "load"\nx = ', ["row 2", "not TOML"]),
     "TOML deep": (T, "x = " + "[" * 20_000, ["nested"]),
     "control unknown": (T, 'control = "force"', ["'control'", "'force'", '"displacement"']),
     "control no text": (T, "control = [1]", ["'control'", "Write"]),
     "key in wrong case": (T, 'Control = "load"', ["'Control'", "Did you mean 'control'"]),
-    "resolution text": (T, 'force_resolution_mN = "0.1"', ["'force_resolution_mN'", "not a positive number", "quotes"]),
     "resolution negative": (T, "force_resolution_mN = -1", ["'force_resolution_mN'", "not a positive number"]),
     "resolution NaN": (T, "displacement_resolution_um = nan", ["'displacement_resolution_um'", "not a positive"]),
-    "resolution true": (T, "force_resolution_mN = true", ["'force_resolution_mN'", "not a positive number"]),
-    "punch zero": (T, "punch_diameter_um = 0", ["'punch_diameter_um'", "not a positive number"]),
     "punch huge": (T, "punch_diameter_um = 1" + "0" * 400, ["'punch_diameter_um'", "64 bits"]),
     "punch without unit": (T, "punch_diameter = 500", ["'punch_diameter'", "unit is missing", "punch_diameter_um"]),
-    "punch in bananas": (T, "punch_diameter_bananas = 500", ["'punch_diameter_bananas'", "unknown"]),
     "punch twice": (T, "punch_diameter_um = 500\npunch_diameter_mm = 0.5", ["2 times", "Keep one"]),
     "provenance no text": (T, "provenance = 3", ["'provenance'", "`str", "quotes"]),
     "corrections no list": (T, 'corrections = "creep"', ["'corrections'", "list of names"]),
-    "corrections of numbers": (T, "corrections = [1]", ["'corrections'", "list of names"]),
     "TOML in Latin-1": (T, 'x = 1\nprovenance = "\xb5"'.encode("latin-1"), ["row 2", "UTF-8"]),
 }
 
@@ -335,14 +306,6 @@ def test_round_trip_is_exact(tmp_path_factory, parts):
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("name", ["01", "NA", "a,b", 'q"q', "a\nb", "粒子", " x ", "1e5", "a\rb"])
-def test_names_stay_as_they_are(tmp_path, name):
-    curve = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([-0.0, 1 / 3]))
-    campaign = Campaign((name, "other"), np.full((2, 3), 100.1), (curve, curve), {"x y": (name, "")})
-    write_campaign(campaign, tmp_path / "c")
-    assert_same(read_campaign(tmp_path / "c"), campaign)
-
-
 def test_numbers_are_rounded_as_python_rounds_them():
     rng = np.random.default_rng(0)
     values = rng.integers(0, 2**64, 20_000, dtype=np.uint64).view(float)
@@ -362,12 +325,11 @@ def test_what_is_no_number_is_named_wherever_it_is(cell):
     assert caught.value.index == 40_000
 
 
-LINE = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([0.0, 1]))
+LINE = Curve([0, 1], [0, 1], [0, 1])
 
 
 def simple(**changes) -> Campaign:
-    curve = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([0.0, 1]))
-    parts = {"particles": ("A",), "diameters_um": np.full((1, 3), 100.0), "curves": (curve,)}
+    parts = {"particles": ("A",), "diameters_um": np.full((1, 3), 100.0), "curves": (LINE,)}
     return Campaign(**parts | changes)
 
 
@@ -380,12 +342,12 @@ def simple(**changes) -> Campaign:
         ({"particles": ("\0",)}, "NUL"),
         ({"particles": ("\ud800",)}, "Unicode"),
         ({"particles": ("  ",)}, "empty"),
-        ({"curves": (Curve(np.array([0.0, 1]), np.array([0.0, np.nan]), np.ones(2)),)}, "force of particle 'A' is nan"),
-        ({"curves": (Curve(np.array([1.0, 0]), np.ones(2), np.ones(2)),)}, "goes back at sample 2"),
-        ({"curves": (Curve(np.zeros(1), np.ones(1), np.ones(1)),)}, "one row only"),
-        ({"curves": (Curve(np.zeros(2), np.zeros(2), np.ones(2)),)}, "every force"),
+        ({"curves": (Curve([0, 1], [0, np.nan], [1, 1]),)}, "force of test 'A' is nan"),
+        ({"curves": (Curve([1, 0], [1, 1], [1, 1]),)}, "goes back.*sample 2"),
+        ({"curves": (Curve([0], [1], [1]),)}, "one row only"),
+        ({"curves": (Curve([0, 0], [0, 0], [1, 1]),)}, "every force"),
         ({"columns": {"D1_um": ("x",)}}, "name of a further column"),
-        ({"metadata": Metadata(other={"control": 1})}, "cannot be a key"),
+        ({"metadata": Metadata(other={"control": 1})}, "cannot be a further key"),
         ({"metadata": Metadata(other={"x": None})}, "no form in TOML"),
         ({"metadata": Metadata(other={"force_resolution_N": 1})}, "would not read back"),
     ],
@@ -461,24 +423,9 @@ def test_failure_leaves_everything_as_it_was(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["c"]
 
 
-def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
+def test_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match=r"is a file, not a folder\. Give another folder"):
         write_campaign(simple(), tmp_path / "file")
     with pytest.raises(InputError, match=r"cannot be written.*Give a folder you may write to"):
         write_campaign(simple(), tmp_path / "file" / "below")
-
-    def refuse(self, **_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(InputError, match="Permission denied"):
-        write_campaign(simple(), tmp_path / "new")
-
-
-@pytest.mark.parametrize("names", [("00", "000"), ("01", "1"), ("1e3", "1000.0"), ("True", "nan"), ("0x1", "1_0")])
-def test_names_that_look_like_numbers_stay_text(tmp_path, names):
-    (tmp_path / "particles.csv").write_text("particle,D1_um,D2_um,D3_um\n" + "".join(f"{n},100,90,80\n" for n in names))
-    rows = "".join(f"{n},0,0,0\n{n},1,2,3\n" for n in names)
-    (tmp_path / "curves.csv").write_text("particle,time_s,force_mN,displacement_um\n" + rows)
-    assert read_campaign(tmp_path).particles == names

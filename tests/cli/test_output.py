@@ -145,8 +145,8 @@ def test_one_run_at_a_time(tmp_path):
 
 def test_left_overs_of_a_killed_run_are_cleared(tmp_path):
     (tmp_path / LOCK).write_text("1\n")
-    (tmp_path / f"{WORK}x" / "new").mkdir(parents=True)
-    (tmp_path / f"{WORK}x" / "new" / "half").write_text("half")
+    (tmp_path / WORK).mkdir()
+    (tmp_path / WORK / "half").write_text("half")
     with results(tmp_path) as stage:
         (stage.folder / "a").write_text("a")
     assert snapshot(tmp_path) == {"a": b"a"}

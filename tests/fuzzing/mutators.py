@@ -9,32 +9,13 @@ from random import Random
 from typing import Any
 
 NASTY = [
-    *(
-        b"",
-        b",",
-        b"\n",
-        b"\r",
-        b"\r\n",
-        b"\t",
-        b" ",
-        b'"',
-        b'""',
-        b"'",
-        b";",
-        b":",
-        b"=",
-        b"[",
-        b"]",
-        b"[[",
-        b"{",
-        b"}",
-    ),
-    *(b"#", b"\\", b"/", b"..", b"\0", b"\x1a", b"\x0b", b"\x0c", b"\x7f", b"\xff", b"\xef\xbb\xbf", b"\xb5", b"null"),
-    *(b"nan", b"inf", b"true", b"-", b".", b"e", b"1e400", b"1_0", b"0x1", b"1.2.3", b"<script>", b"%s", b"{0}"),
-    *("µ", "μ", "１", "\u2028", "\u202e", "é", "\U0001f9ea"),
-    *(b"\xed\xa0\x80", b"\\ud800", b"\\u0000", b"force_mN", b"time_s", b"particle", b"D1_um", b"F\th\tt", b"../../x"),
-    *(b"[" * 3000, b"9" * 5000, b"0x" + b"f" * 5000, b"A" * 150_000, b"\n" * 50_000, b" " * 3000, b"a.b." * 500),
-]
+    b"", b",", b"\n", b"\r", b"\r\n", b"\t", b" ", b'"', b'""', b"'", b";", b":", b"=", b"[", b"]", b"[[", b"{", b"}",
+    b"#", b"\\", b"/", b"..", b"\0", b"\x1a", b"\x0b", b"\x0c", b"\x7f", b"\xff", b"\xef\xbb\xbf", b"\xb5", b"null",
+    b"nan", b"inf", b"true", b"-", b".", b"e", b"1e400", b"1_0", b"0x1", b"1.2.3", b"<script>", b"%s", b"{0}",
+    "µ", "μ", "１", "\u2028", "\u202e", "é", "\U0001f9ea",
+    b"\xed\xa0\x80", b"\\ud800", b"\\u0000", b"force_mN", b"time_s", b"particle", b"D1_um", b"F\th\tt", b"../../x",
+    b"[" * 3000, b"9" * 5000, b"0x" + b"f" * 5000, b"A" * 150_000, b"\n" * 50_000, b" " * 3000, b"a.b." * 500,
+]  # fmt: skip
 NASTY = [piece.encode() if isinstance(piece, str) else piece for piece in NASTY]
 NUMBERS = [
     *(b"nan", b"inf", b"-inf", b"1e400", b"-1e400", b"1e308", b"-1", b"0", b"-0.0", b"1e-320", b"", b" ", b"x", b"1,5"),
@@ -135,27 +116,10 @@ def mutate(rng: Random, data: bytes, other: bytes) -> bytes:
 
 
 VALUES = (
-    *(
-        None,
-        True,
-        False,
-        0,
-        -1,
-        1,
-        0.5,
-        -0.0,
-        1e-320,
-        1e300,
-        -1e300,
-        1e308,
-        10**18,
-        10**400,
-        float("nan"),
-        float("inf"),
-    ),
-    *("", " ", "x", "\ud800", "\0", "\n", "\u202e", "</script>", "{{ 7 * 7 }}", "%s", "../..", "1", "A" * 9000, "é"),
-    *([], {}, [[]], [None], {"": ""}, {"value": None}, [1, 2], [1e300, -1e300]),
-)
+    None, True, False, 0, -1, 1, 0.5, -0.0, 1e-320, 1e300, -1e300, 1e308, 10**18, 10**400, float("nan"), float("inf"),
+    "", " ", "x", "\ud800", "\0", "\n", "\u202e", "</script>", "{{ 7 * 7 }}", "%s", "../..", "1", "A" * 9000, "é",
+    [], {}, [[]], [None], {"": ""}, {"value": None}, [1, 2], [1e300, -1e300],
+)  # fmt: skip
 
 
 def mutate_json(rng: Random, data: bytes) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ class Kind:
         make: the campaign of a random generator.
         reads: valid data: the joint methods must give an answer, with the modulus near 16 GPa where `modulus` says so.
         refused: nothing that could be calibrated: every method must refuse it.
-        slip: a slip of unit, sign or column, of which the check of plausibility must say something.
+        slip: an error of unit, sign or column, which the check of plausibility must report.
         suspect: an answer, if there is one, must come with a warning or as not converged.
         modulus: factor within which the modulus must be right; None if it need not be.
         says: what an error, or a particle's reason, must contain.
@@ -43,20 +43,6 @@ class Kind:
     damage: Callable[[np.random.Generator, Path], None] | None = None
 
 
-KINDS: list[Kind] = []
-"""The catalogue, in order."""
-
-Maker = Callable[[np.random.Generator], Campaign]
-
-
-def kind(name: str, **facts) -> Callable[[Maker], Maker]:
-    def add(make: Maker) -> Maker:
-        KINDS.append(Kind(name, make, **facts))
-        return make
-
-    return add
-
-
 # ---- what the kinds are made of --------------------------------------------------------------------------------------
 
 
@@ -66,682 +52,348 @@ def _simulated(seed: int, programme: Programme, noise_um: float, noise_mN: float
     return paper_campaign(seed, programme=programme, instrument=instrument)
 
 
-ONE_CYCLE = Programme.cycles(points=POINTS)
-
-
-def plain(
-    rng: np.random.Generator,
-    programme: Programme = ONE_CYCLE,
-    *,
-    count: int = PARTICLES,
-    noise_um: float = 0.02,
-    noise_mN: float = 0.05,
-) -> Campaign:
+def plain(rng, programme: Programme | None = None, *, count=PARTICLES, noise_um=0.02, noise_mN=0.05) -> Campaign:
     """A few particles of one of three campaigns."""
+    programme = Programme.cycles(points=POINTS) if programme is None else programme
     whole = _simulated(int(rng.integers(3)), programme, noise_um, noise_mN)
     keep = np.zeros(len(whole), bool)
     keep[rng.choice(len(whole), count, replace=False)] = True
     return whole.select(keep)
 
 
+def cycles(rng, levels: Sequence[float] = (1.0,), *, count=PARTICLES, **settings) -> Campaign:
+    return plain(rng, Programme.cycles(levels=tuple(np.asarray(levels).tolist()), **settings), count=count)
+
+
+def ramps(rng, *forces: float, points: int) -> Campaign:
+    return plain(rng, Programme("load", tuple(Ramp(force, 2.0) for force in forces), points=points))
+
+
 def each(campaign: Campaign, change: Callable[[Curve], Curve]) -> Campaign:
     return replace(campaign, curves=tuple(change(curve) for curve in campaign.curves))
 
 
-def force(campaign: Campaign, change: Callable[[np.ndarray], np.ndarray]) -> Campaign:
-    return each(campaign, lambda c: replace(c, force_mN=change(c.force_mN)))
-
-
-def displacement(campaign: Campaign, change: Callable[[np.ndarray], np.ndarray]) -> Campaign:
-    return each(campaign, lambda c: replace(c, displacement_um=change(c.displacement_um)))
-
-
-def clock(campaign: Campaign, change: Callable[[np.ndarray], np.ndarray]) -> Campaign:
-    return each(campaign, lambda c: replace(c, time_s=change(c.time_s)))
-
-
 def rows(campaign: Campaign, choose: Callable[[Curve], np.ndarray]) -> Campaign:
-    def one(curve: Curve) -> Curve:
-        keep = choose(curve)
-        return Curve(curve.time_s[keep], curve.force_mN[keep], curve.displacement_um[keep])
+    def chosen(c: Curve) -> Curve:
+        keep = choose(c)
+        return Curve(c.time_s[keep], c.force_mN[keep], c.displacement_um[keep])
 
-    return each(campaign, one)
+    return each(campaign, chosen)
+
+
+def changed(campaign: Campaign, rng, **changes: Callable) -> Campaign:
+    """One channel of every test changed after the other."""
+    for name, change in changes.items():
+        campaign = each(campaign, lambda c: replace(c, **{name: change(getattr(c, name), rng)}))  # noqa: B023
+    return campaign
+
+
+def first_of(one: Campaign, others: Campaign) -> Campaign:
+    return replace(others, curves=(one.curves[0], *others.curves[1:]))
+
+
+def first_changed(**changes: Callable) -> Callable:
+    return lambda campaign, rng: first_of(changed(campaign, rng, **changes), campaign)
+
+
+def scaled(campaign: Campaign, size: float, stress: float = 1.0) -> Campaign:
+    """The same tests of a body some times larger and stiffer."""
+    larger = each(campaign, lambda c: Curve(c.time_s, c.force_mN * size**2 * stress, c.displacement_um * size))
+    return replace(larger, diameters_um=campaign.diameters_um * size)
 
 
 def top(curve: Curve) -> int:
     return int(np.argmax(curve.force_mN))
 
 
-def first_only(campaign: Campaign, change: Callable[[Campaign], Campaign]) -> Campaign:
-    """The change made to the first particle alone."""
-    changed = change(campaign)
-    return replace(campaign, curves=(changed.curves[0], *campaign.curves[1:]))
+def from_top(curve: Curve) -> np.ndarray:
+    return np.arange(top(curve), len(curve))
 
 
-def spiked(values: np.ndarray, rng: np.random.Generator, size: float, count: int = 1) -> np.ndarray:
+def every(stride: int) -> Callable[[Curve], np.ndarray]:
+    return lambda c: np.unique(np.r_[np.arange(0, len(c), stride), top(c), len(c) - 1])
+
+
+def spiked(values: np.ndarray, rng, size: float, count: int = 1) -> np.ndarray:
     values = values.copy()
     values[rng.integers(5, len(values) - 5, count)] += size
     return values
 
 
-# ---- valid data ------------------------------------------------------------------------------------------------------
+def stuck(values: np.ndarray, _) -> np.ndarray:
+    place = np.arange(len(values))
+    return np.where((place >= 20) & (place < 45), values[20], values)
 
 
-@kind("plain", reads=True, modulus=1.5)
-def _(rng):
-    return plain(rng)
+def instead(number: float) -> Callable:
+    """The 34th reading is another number."""
+    return lambda values, _: np.where(np.arange(len(values)) == 33, number, values)
 
 
-@kind("500 cycles to rising levels", reads=True, modulus=2)
-def _(rng):
-    levels = tuple(np.linspace(0.3, 1, 500).tolist())
-    return plain(rng, Programme.cycles(levels=levels, unload_to=0.1, points=6000))
+def constant(number: float) -> Callable:
+    return lambda values, _: np.full(len(values), number)
 
 
-@kind("500 cycles to one level", reads=True, modulus=2)
-def _(rng):
-    return plain(rng, Programme.cycles(levels=(1.0,) * 500, unload_to=0.1, points=30_000))
+def steps(size: float) -> Callable:
+    return lambda values, _: np.round(values / size) * size
 
 
-@kind("500 cycles to rising levels, two samples each", reads=True)
-def _(rng):
-    return plain(rng, Programme.cycles(levels=tuple(np.linspace(0.05, 1, 500).tolist()), unload_to=0.0))
+def times(factor: float) -> Callable:
+    return lambda values, _: values * factor
 
 
-@kind("300 cycles to random levels", reads=True, modulus=2)
-def _(rng):
-    levels = tuple(np.random.default_rng(0).uniform(0.2, 1, 300).tolist())
-    return plain(rng, Programme.cycles(levels=levels, unload_to=0.1, points=9000))
+def noise(values: np.ndarray, rng, sd: float, mean: float = 0.0) -> np.ndarray:
+    return mean + rng.normal(0, sd, len(values))
 
 
-@kind("100 cycles, ten samples each", reads=True, modulus=2)
-def _(rng):
-    return plain(rng, Programme.cycles(levels=tuple(np.linspace(0.2, 1, 100).tolist()), unload_to=0.3, points=1000))
+# ---- campaigns that take more than a line ----------------------------------------------------------------------------
 
 
-@kind("force in steps of a tenth of the peak", reads=True)
-def _(rng):
-    return each(plain(rng), lambda c: replace(c, force_mN=np.round(c.force_mN / (s := c.force_mN.max() / 10.4)) * s))
+def approach(rng) -> Campaign:
+    def longer(c: Curve) -> Curve:
+        air, scatter = np.linspace(-30, 0, 200, endpoint=False), rng.normal(0, 0.05, 200)
+        time = np.concatenate([np.arange(200) * 0.1, 20 + c.time_s])
+        return Curve(time, np.concatenate([scatter, c.force_mN]), np.concatenate([air, c.displacement_um]))
+
+    return each(plain(rng), longer)
 
 
-@kind("force in steps of 200 mN", reads=False)
-def _(rng):
-    return force(plain(rng), lambda f: np.round(f / 200) * 200)
-
-
-@kind("displacement in steps of 1 um", reads=True)
-def _(rng):
-    return displacement(plain(rng), np.round)
-
-
-@kind("force and displacement coarse", reads=True)
-def _(rng):
-    return displacement(force(plain(rng), lambda f: np.round(f / 5) * 5), lambda d: np.round(d / 0.5) * 0.5)
-
-
-@kind("all displacements below zero", reads=True, modulus=1.5)
-def _(rng):
-    return displacement(plain(rng), lambda d: d - d.max() - 5)
-
-
-@kind("displacement from a far origin", reads=True, modulus=1.5)
-def _(rng):
-    offset = float(10 ** rng.uniform(2, 5))
-    return displacement(plain(rng), lambda d: d + offset)
-
-
-@kind("displacement from a far origin below zero", reads=True, modulus=1.5)
-def _(rng):
-    return displacement(plain(rng), lambda d: d - 12_345.0)
-
-
-@kind("no approach, begins in contact", reads=True)
-def _(rng):
-    return rows(plain(rng), lambda c: np.arange(4, len(c)))
-
-
-@kind("an approach of 200 samples", reads=True, modulus=1.5)
-def _(rng):
-    def one(c: Curve) -> Curve:
-        air = np.linspace(-30, 0, 200, endpoint=False)
-        noise = rng.normal(0, 0.05, 200)
-        return Curve(
-            np.concatenate([np.arange(200) * 0.1, 20 + c.time_s]),
-            np.concatenate([noise, c.force_mN]),
-            np.concatenate([air, c.displacement_um]),
-        )
-
-    return each(plain(rng), one)
-
-
-@kind("100,000 rows", reads=True, modulus=1.5)
-def _(rng):
-    def one(c: Curve) -> Curve:
+def many_rows(rng) -> Campaign:
+    def finer(c: Curve) -> Curve:
         t = np.linspace(c.time_s[0], c.time_s[-1], 100_000)
         f = np.interp(t, c.time_s, c.force_mN) + rng.normal(0, 0.05, len(t))
         return Curve(t, f, np.interp(t, c.time_s, c.displacement_um) + rng.normal(0, 0.02, len(t)))
 
-    return each(plain(rng), one)
+    return each(plain(rng), finer)
 
 
-@kind("12 to 20 rows")
-def _(rng):
+def few_rows(rng) -> Campaign:
     stride = int(rng.integers(5, 9))
-    return rows(plain(rng), lambda c: np.unique(np.r_[np.arange(0, len(c), stride), top(c), len(c) - 1]))
+    return rows(plain(rng), every(stride))
 
 
-@kind("30 rows", reads=True)
-def _(rng):
-    return rows(plain(rng), lambda c: np.unique(np.r_[np.arange(0, len(c), 3), top(c), len(c) - 1]))
+def mixed_control(rng) -> Campaign:
+    one, two = plain(rng, count=2), cycles(rng, **CONTROLLED, count=2)
+    return Campaign(tuple("abcd"), np.concatenate([one.diameters_um, two.diameters_um]), one.curves + two.curves)
 
 
-@kind("one particle")
-def _(rng):
-    return plain(rng, count=1)
+def far_origin(rng) -> Campaign:
+    offset, campaign = float(10 ** rng.uniform(2, 5)), plain(rng)
+    return each(campaign, lambda c: replace(c, displacement_um=c.displacement_um + offset))
 
 
-@kind("two particles", reads=True)
-def _(rng):
-    return plain(rng, count=2)
-
-
-@kind("a hold at every level", reads=True, modulus=2)
-def _(rng):
-    return plain(rng, Programme.cycles(levels=(0.4, 0.7, 1.0), hold_s=30.0, unload_to=0.2, points=300))
-
-
-@kind("displacement control", reads=True, modulus=2)
-def _(rng):
-    return plain(rng, Programme.cycles(control="displacement", rate=0.5, points=POINTS))
-
-
-@kind("tests under load and displacement mixed", reads=True, modulus=2)
-def _(rng):
-    one = plain(rng, count=2)
-    two = plain(rng, Programme.cycles(control="displacement", rate=0.5, points=POINTS), count=2)
-    return Campaign(("a", "b", "c", "d"), np.concatenate([one.diameters_um, two.diameters_um]), one.curves + two.curves)
-
-
-@kind("partial unloading only", reads=True)
-def _(rng):
-    return plain(rng, Programme("load", (Ramp(1.0, 2.0), Ramp(0.6, 2.0)), points=POINTS))
-
-
-@kind("reload beyond the first peak", reads=True, modulus=2)
-def _(rng):
-    return plain(rng, Programme("load", tuple(Ramp(v, 2.0) for v in (0.5, 0.1, 0.9, 0.1, 1.0, 0.0)), points=160))
-
-
-@kind("perfect readings", reads=True, modulus=1.5)
-def _(rng):
-    return plain(rng, noise_um=0.0, noise_mN=0.0)
-
-
-@kind("odd names and texts", reads=True)
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, particles=("a,b", 'say "x"', "№ 5 µm – ü", "=1+1;\t'"), columns={})
-
-
-@kind("time in hours and starting late", reads=True, modulus=1.5)
-def _(rng):
-    return clock(plain(rng), lambda t: t / 3600 + 1e6)
-
-
-@kind("every time stamp twice", reads=True, modulus=1.5)
-def _(rng):
-    return clock(plain(rng), lambda t: np.repeat(t[::2], 2)[: len(t)])
-
-
-@kind("one time stamp", reads=True)
-def _(rng):
-    return clock(plain(rng), lambda t: np.full(len(t), 3.0))
-
-
-@kind("a pause of a year", reads=True, modulus=1.5)
-def _(rng):
-    return clock(plain(rng), lambda t: t + np.where(np.arange(len(t)) > 60, 3e7, 0.0))
-
-
-@kind("every row twice", reads=True, modulus=2)
-def _(rng):
-    return rows(plain(rng), lambda c: np.repeat(np.arange(len(c)), 2))
-
-
-def pebble(rng: np.random.Generator, *, count: int = PARTICLES) -> Campaign:
-    """The same tests of a body some times larger and stiffer: a ceramic pebble of 1 mm that takes 100 N."""
+def pebble(rng, *, count: int = PARTICLES) -> Campaign:
+    """A ceramic pebble of 1 mm that takes 100 N."""
     campaign, size, stress = plain(rng, count=count), float(rng.uniform(4, 7)), float(rng.uniform(10, 25))
-    scaled = force(displacement(campaign, lambda d: d * size), lambda f: f * size**2 * stress)
     true = replace(campaign.metadata, other={"simulation": {"effective_modulus_MPa": MODULUS_MPA * stress}})
-    return replace(scaled, diameters_um=campaign.diameters_um * size, metadata=true)
+    return replace(scaled(campaign, size, stress), metadata=true)
 
 
-@kind("ceramic pebbles of 1 mm and 100 N", reads=True, modulus=1.5)
-def _(rng):
-    return pebble(rng)
-
-
-@kind("tablets of 10 mm", reads=True, modulus=1.5)
-def _(rng):
-    campaign = plain(rng)
-    scaled = force(displacement(campaign, lambda d: d * 50), lambda f: f * 2500)
-    return replace(scaled, diameters_um=campaign.diameters_um * 50)
-
-
-@kind("soft spheres, stresses of kPa, no threshold reached", suspect=True)
-def _(rng):
-    return force(plain(rng), lambda f: f * 1e-3)
-
-
-@kind("one particle tested, all others below the threshold")
-def _(rng):
-    campaign = plain(rng)
-    return replace(
-        campaign,
-        curves=(campaign.curves[0], *(replace(c, force_mN=c.force_mN * 1e-3) for c in campaign.curves[1:])),
-    )
-
-
-# ---- unusual particles -----------------------------------------------------------------------------------------------
-
-
-@kind("all spheres")
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, diameters_um=np.repeat(campaign.diameters_um[:, :1], 3, axis=1))
-
-
-@kind("identical particles", suspect=True)
-def _(rng):
+def identical(rng) -> Campaign:
     one = plain(rng, count=1)
-    return Campaign(("a", "b", "c", "d"), np.repeat(one.diameters_um, 4, axis=0), one.curves * 4)
-
-
-@kind("same size and shape", reads=True)
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, diameters_um=np.repeat(campaign.diameters_um[:1], len(campaign), axis=0))
-
-
-@kind("one particle a thousand times larger")
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, diameters_um=campaign.diameters_um * np.r_[1e3, 1, 1, 1][:, None])
-
-
-@kind("one particle a thousand times smaller")
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, diameters_um=campaign.diameters_um * np.r_[1e-3, 1, 1, 1][:, None])
-
-
-@kind("needles and flakes")
-def _(rng):
-    campaign = plain(rng)
-    shapes = np.array([[1, 1, 0.05], [1, 0.05, 1], [0.05, 1, 1], [1, 1, 20.0]])
-    return replace(campaign, diameters_um=campaign.diameters_um * shapes)
-
-
-@kind("particle that snaps through")
-def _(rng):
-    def snap(d: np.ndarray) -> np.ndarray:
-        at = int(rng.integers(10, 40))
-        return d + np.where(np.arange(len(d)) >= at, 0.2 * d.max(), 0.0)
-
-    return displacement(plain(rng), snap)
-
-
-# ---- scales ----------------------------------------------------------------------------------------------------------
-
-for power in (-14, -9, -6, -3, 3, 6, 9, 14):
-
-    @kind(f"force times 1e{power}", slip=True)
-    def _(rng, power=power):
-        return force(plain(rng), lambda f: f * 10.0**power)
-
-    @kind(f"displacement times 1e{power}", slip=True)
-    def _(rng, power=power):
-        return displacement(plain(rng), lambda d: d * 10.0**power)
-
-
-for power in (-14, -6, 6, 9):
-
-    @kind(f"time times 1e{power}", reads=True)
-    def _(rng, power=power):
-        return clock(plain(rng), lambda t: t * 10.0**power)
-
-
-for power in (-3, 3, 9):
-
-    @kind(f"diameters times 1e{power}", slip=True)
-    def _(rng, power=power):
-        campaign = plain(rng)
-        return replace(campaign, diameters_um=campaign.diameters_um * 10.0**power)
-
-
-@kind("force of the first particle times 1e6", says="where the others reach")
-def _(rng):
-    return first_only(plain(rng), lambda c: force(c, lambda f: f * 1e6))
-
-
-@kind("displacement of the first particle times 1e6", says="of its size where the others")
-def _(rng):
-    return first_only(plain(rng), lambda c: displacement(c, lambda d: d * 1e6))
-
-
-# ---- signs -----------------------------------------------------------------------------------------------------------
-
-
-@kind("displacement of the other sign", slip=True)
-def _(rng):
-    return displacement(plain(rng), np.negative)
-
-
-@kind("force of the other sign", slip=True)
-def _(rng):
-    return force(plain(rng), np.negative)
-
-
-@kind("both of the other sign", slip=True)
-def _(rng):
-    return displacement(force(plain(rng), np.negative), np.negative)
-
-
-@kind("force and displacement swapped", slip=True)
-def _(rng):
-    return each(plain(rng), lambda c: Curve(c.time_s, c.displacement_um, c.force_mN))
-
-
-# ---- parts of a test -------------------------------------------------------------------------------------------------
-
-
-@kind("unloading only", refused=True, says="begins at its largest force")
-def _(rng):
-    return rows(plain(rng), lambda c: np.arange(top(c), len(c)))
-
-
-@kind("unloading and a reload to the same force", refused=True, says="begins at its largest force")
-def _(rng):
-    whole = plain(rng, Programme.cycles(levels=(1.0, 0.95), unload_to=0.1, points=160))
-    return rows(whole, lambda c: np.arange(top(c), len(c)))
-
-
-@kind("approach only", refused=True)
-def _(rng):
-    return each(
-        plain(rng),
-        lambda c: Curve(c.time_s, rng.normal(0, 0.05, len(c)), np.linspace(-20, 0, len(c)) + rng.normal(0, 0.02)),
-    )
-
-
-@kind("hold only", refused=True)
-def _(rng):
-    return each(
-        plain(rng),
-        lambda c: Curve(c.time_s, 100 + rng.normal(0, 0.05, len(c)), 20 + rng.normal(0, 0.02, len(c))),
-    )
-
-
-@kind("loading only", suspect=True)
-def _(rng):
-    return rows(plain(rng), lambda c: np.arange(top(c) + 1))
-
-
-@kind("two points each", refused=True)
-def _(rng):
-    return rows(plain(rng), lambda c: np.r_[0, top(c)])
-
-
-@kind("one test of two points", reads=True)
-def _(rng):
-    return first_only(plain(rng), lambda c: rows(c, lambda one: np.r_[0, top(one)]))
-
-
-@kind("loads below the threshold only", refused=True, says="threshold")
-def _(rng):
-    return rows(plain(rng), lambda c: np.flatnonzero(c.force_mN < 3.0))
-
-
-@kind("begins in the middle of loading", suspect=False)
-def _(rng):
-    return rows(plain(rng), lambda c: np.arange(top(c) // 2, len(c)))
-
-
-@kind("begins in the middle of unloading", refused=True, says="begins at its largest force")
-def _(rng):
-    return rows(plain(rng), lambda c: np.arange((top(c) + len(c)) // 2, len(c)))
-
-
-@kind("three particles of four unloading only", says="begins at its largest force")
-def _(rng):
-    campaign = plain(rng)
-    cut = rows(campaign, lambda c: np.arange(top(c), len(c)))
-    return replace(campaign, curves=(campaign.curves[0], *cut.curves[1:]))
-
-
-# ---- broken sensors --------------------------------------------------------------------------------------------------
-
-
-@kind("constant force", refused=True)
-def _(rng):
-    return force(plain(rng), lambda f: np.full(len(f), 50.0))
-
-
-@kind("constant displacement", refused=True)
-def _(rng):
-    return displacement(plain(rng), lambda d: np.full(len(d), 10.0))
-
-
-@kind("constant force and displacement", refused=True)
-def _(rng):
-    return displacement(force(plain(rng), lambda f: np.full(len(f), 5.0)), lambda d: np.full(len(d), 5.0))
-
-
-@kind("one test of constant force", reads=True)
-def _(rng):
-    return first_only(plain(rng), lambda c: force(c, lambda f: np.full(len(f), 50.0)))
-
-
-@kind("one test of constant displacement", reads=True)
-def _(rng):
-    return first_only(plain(rng), lambda c: displacement(c, lambda d: np.full(len(d), 10.0)))
-
-
-@kind("force of two levels")
-def _(rng):
-    return force(plain(rng), lambda f: np.where(f > f.max() / 2, f.max(), 0.0))
-
-
-@kind("zero of force drifts")
-def _(rng):
-    return force(plain(rng), lambda f: f + np.linspace(0, rng.uniform(-0.3, 0.3) * f.max(), len(f)))
-
-
-@kind("zero of displacement drifts", suspect=False)
-def _(rng):
-    return displacement(plain(rng), lambda d: d + np.linspace(0, rng.uniform(-0.5, 0.5) * np.ptp(d), len(d)))
-
-
-@kind("noise larger than the signal", suspect=True)
-def _(rng):
-    return force(
-        displacement(plain(rng), lambda d: d + rng.normal(0, 2 * np.ptp(d), len(d))),
-        lambda f: f + rng.normal(0, 2 * np.ptp(f), len(f)),
-    )
-
-
-@kind("displacement nothing but noise", suspect=True)
-def _(rng):
-    return displacement(plain(rng), lambda d: rng.normal(0, 1, len(d)))
-
-
-@kind("force nothing but noise", suspect=True)
-def _(rng):
-    return force(plain(rng), lambda f: rng.normal(0, 1, len(f)))
-
-
-@kind("displacement noise of a tenth of the range")
-def _(rng):
-    return displacement(plain(rng), lambda d: d + rng.normal(0, 0.1 * np.ptp(d), len(d)))
-
-
-@kind("loading that goes up and down", suspect=False)
-def _(rng):
-    return force(plain(rng), lambda f: np.abs(f * (1 + 0.3 * np.sin(np.arange(len(f))))))
-
-
-@kind("readings in random order", suspect=True)
-def _(rng):
-    def one(c: Curve) -> Curve:
-        order = rng.permutation(len(c))
-        return Curve(c.time_s, c.force_mN[order], c.displacement_um[order])
-
-    return each(plain(rng), one)
-
-
-@kind("one spike of displacement, 1e6 um")
-def _(rng):
-    return displacement(plain(rng), lambda d: spiked(d, rng, 1e6))
-
-
-@kind("one spike of displacement, -1e6 um")
-def _(rng):
-    return displacement(plain(rng), lambda d: spiked(d, rng, -1e6))
-
-
-@kind("one spike of force, 1e6 mN")
-def _(rng):
-    return force(plain(rng), lambda f: spiked(f, rng, 1e6))
-
-
-@kind("one spike of force, -1e4 mN")
-def _(rng):
-    return force(plain(rng), lambda f: spiked(f, rng, -1e4))
-
-
-@kind("ten spikes of twice the range")
-def _(rng):
-    return displacement(plain(rng), lambda d: spiked(d, rng, 2 * float(np.ptp(d)), 10))
-
-
-@kind("time that jumps once", reads=True)
-def _(rng):
-    return clock(plain(rng), lambda t: np.sort(spiked(t, rng, 1e6)))
-
-
-@kind("force stuck for a while")
-def _(rng):
-    def stuck(f: np.ndarray) -> np.ndarray:
-        f = f.copy()
-        f[20:45] = f[20]
-        return f
-
-    return force(plain(rng), stuck)
-
-
-@kind("displacement stuck for a while")
-def _(rng):
-    def stuck(d: np.ndarray) -> np.ndarray:
-        d = d.copy()
-        d[20:45] = d[20]
-        return d
-
-    return displacement(plain(rng), stuck)
-
-
-@kind("force saturated at 80 %")
-def _(rng):
-    return force(plain(rng), lambda f: np.minimum(f, 0.8 * f.max()))
-
-
-@kind("particle breaks: the force is gone")
-def _(rng):
-    def broken(f: np.ndarray) -> np.ndarray:
-        at = int(0.35 * len(f))
-        return np.where(np.arange(len(f)) >= at, 0.1 * f, f)
-
-    return force(plain(rng), broken)
-
-
-# ---- what no campaign may hold ---------------------------------------------------------------------------------------
-
-
-@kind("not a number in displacement", refused=True, says="nan")
-def _(rng):
-    return displacement(plain(rng), lambda d: np.where(np.arange(len(d)) == 33, np.nan, d))
-
-
-@kind("not a number in force", refused=True, says="nan")
-def _(rng):
-    return force(plain(rng), lambda f: np.where(np.arange(len(f)) == 33, np.nan, f))
-
-
-@kind("infinite displacement", refused=True, says="inf")
-def _(rng):
-    return displacement(plain(rng), lambda d: np.where(np.arange(len(d)) == 33, np.inf, d))
-
-
-@kind("a diameter that is not a number", refused=True, says="diameters")
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, diameters_um=campaign.diameters_um * np.r_[np.nan, 1, 1, 1][:, None])
-
-
-@kind("a negative diameter", refused=True, says="diameters")
-def _(rng):
-    campaign = plain(rng)
-    return replace(campaign, diameters_um=campaign.diameters_um * np.r_[-1, 1, 1, 1][:, None])
-
-
-@kind("time that starts again", refused=True, says="time")
-def _(rng):
-    return clock(plain(rng), lambda t: np.where(np.arange(len(t)) > 50, t - t[50], t))
-
-
-@kind("no particle", refused=True, says="no particle")
-def _(rng):
-    return Campaign((), np.empty((0, 3)), ())
-
-
-@kind("all forces zero", refused=True, says="zero")
-def _(rng):
-    return force(plain(rng), np.zeros_like)
-
-
-@kind("one row each", refused=True, says="row")
-def _(rng):
-    return rows(plain(rng), lambda c: np.r_[top(c)])
-
-
-@kind("one name twice", refused=True, says="times")
-def _(rng):
-    return replace(plain(rng), particles=("a", "a", "b", "c"))
-
-
-@kind("force and displacement of unlike lengths", refused=True, says="entries")
-def _(rng):
-    return force(plain(rng), lambda f: f[:-3])
+    return Campaign(tuple("abcd"), np.repeat(one.diameters_um, 4, axis=0), one.curves * 4)
+
+
+def snaps(d: np.ndarray, rng) -> np.ndarray:
+    start = int(rng.integers(10, 40))
+    return d + np.where(np.arange(len(d)) >= start, 0.2 * d.max(), 0.0)
+
+
+def approach_alone(c: Curve, rng) -> Curve:
+    return Curve(c.time_s, noise(c.time_s, rng, 0.05), np.linspace(-20, 0, len(c)) + rng.normal(0, 0.02))
+
+
+def hold_alone(c: Curve, rng) -> Curve:
+    return Curve(c.time_s, noise(c.time_s, rng, 0.05, 100), noise(c.time_s, rng, 0.02, 20))
+
+
+def shuffled(c: Curve, rng) -> Curve:
+    order = rng.permutation(len(c))
+    return Curve(c.time_s, c.force_mN[order], c.displacement_um[order])
+
+
+def drowned(values: np.ndarray, rng) -> np.ndarray:
+    return values + noise(values, rng, 2 * np.ptp(values))
+
+
+CONTROLLED = {"control": "displacement", "rate": 0.5, "points": POINTS}
+ODD = ("a,b", 'say "x"', "№ 5 µm – ü", "=1+1;\t'")
+RANDOM = np.random.default_rng(0).uniform(0.2, 1, 300)
+RISING, FALLING = np.linspace(0.3, 1, 500), (1.0, 0.95)
+
+# ---- the catalogue ---------------------------------------------------------------------------------------------------
+
+ANY, READS, SUSPECT, SLIP, REFUSED = {}, {"reads": True}, {"suspect": True}, {"slip": True}, {"refused": True}
+NEAR, ROUGHLY = READS | {"modulus": 1.5}, READS | {"modulus": 2}
+UNLOADS = {"says": "begins at its largest force"}
+WEAK, SHORT = {"says": "where the others reach"}, {"says": "of its size where the others"}
+WHOLE = {
+    "plain": (NEAR, plain),
+    "500 cycles to rising levels": (ROUGHLY, lambda rng: cycles(rng, RISING, unload_to=0.1, points=6000)),
+    "500 cycles to one level": (ROUGHLY, lambda rng: cycles(rng, np.ones(500), unload_to=0.1, points=30_000)),
+    "500 cycles to rising levels, two samples each": (
+        READS,
+        lambda rng: cycles(rng, np.linspace(0.05, 1, 500), unload_to=0.0),
+    ),
+    "300 cycles to random levels": (ROUGHLY, lambda rng: cycles(rng, RANDOM, unload_to=0.1, points=9000)),
+    "100 cycles, ten samples each": (
+        ROUGHLY,
+        lambda rng: cycles(rng, np.linspace(0.2, 1, 100), unload_to=0.3, points=1000),
+    ),
+    "displacement from a far origin": (NEAR, far_origin),
+    "an approach of 200 samples": (NEAR, approach),
+    "100,000 rows": (NEAR, many_rows),
+    "12 to 20 rows": (ANY, few_rows),
+    "one particle": (ANY, lambda rng: plain(rng, count=1)),
+    "two particles": (READS, lambda rng: plain(rng, count=2)),
+    "a hold at every level": (
+        ROUGHLY,
+        lambda rng: cycles(rng, (0.4, 0.7, 1.0), hold_s=30.0, unload_to=0.2, points=300),
+    ),
+    "displacement control": (ROUGHLY, lambda rng: cycles(rng, **CONTROLLED)),
+    "tests under load and displacement mixed": (ROUGHLY, mixed_control),
+    "partial unloading only": (READS, lambda rng: ramps(rng, 1.0, 0.6, points=POINTS)),
+    "reload beyond the first peak": (ROUGHLY, lambda rng: ramps(rng, 0.5, 0.1, 0.9, 0.1, 1.0, 0.0, points=160)),
+    "perfect readings": (NEAR, lambda rng: plain(rng, noise_um=0.0, noise_mN=0.0)),
+    "odd names and texts": (READS, lambda rng: replace(plain(rng), particles=ODD, columns={})),
+    "ceramic pebbles of 1 mm and 100 N": (NEAR, pebble),
+    "tablets of 10 mm": (NEAR, lambda rng: scaled(plain(rng), 50)),
+    "identical particles": (SUSPECT, identical),
+    "unloading and a reload to the same force": (
+        REFUSED | UNLOADS,
+        lambda rng: rows(cycles(rng, FALLING, unload_to=0.1, points=160), from_top),
+    ),
+    "no particle": (REFUSED | {"says": "no particle"}, lambda _: Campaign((), np.empty((0, 3)), ())),
+    "one name twice": (REFUSED | {"says": "times"}, lambda rng: replace(plain(rng), particles=tuple("aabc"))),
+}
+"""Campaigns as a whole."""
+SIZES = {
+    "all spheres": (ANY, lambda d: np.repeat(d[:, :1], 3, axis=1)),
+    "same size and shape": (READS, lambda d: np.repeat(d[:1], len(d), axis=0)),
+    "one particle a thousand times larger": (ANY, lambda d: d * np.c_[1e3, 1, 1, 1].T),
+    "one particle a thousand times smaller": (ANY, lambda d: d * np.c_[1e-3, 1, 1, 1].T),
+    "needles and flakes": (ANY, lambda d: d * np.array([[1, 1, 0.05], [1, 0.05, 1], [0.05, 1, 1], [1, 1, 20]])),
+    **{f"diameters times 1e{p}": (SLIP, lambda d, p=p: d * 10.0**p) for p in (-3, 3, 9)},
+    "a diameter that is not a number": (REFUSED | {"says": "diameters"}, lambda d: d * np.c_[np.nan, 1, 1, 1].T),
+    "a negative diameter": (REFUSED | {"says": "diameters"}, lambda d: d * np.c_[-1, 1, 1, 1].T),
+}
+"""Plain campaigns whose diameters are changed."""
+ROWS = {
+    "no approach, begins in contact": (READS, lambda c: np.arange(4, len(c))),
+    "30 rows": (READS, every(3)),
+    "every row twice": (ROUGHLY, lambda c: np.repeat(np.arange(len(c)), 2)),
+    "unloading only": (REFUSED | UNLOADS, from_top),
+    "loading only": (SUSPECT, lambda c: np.arange(top(c) + 1)),
+    "two points each": (REFUSED, lambda c: np.r_[0, top(c)]),
+    "loads below the threshold only": (REFUSED | {"says": "threshold"}, lambda c: np.flatnonzero(c.force_mN < 3.0)),
+    "begins in the middle of loading": (ANY, lambda c: np.arange(top(c) // 2, len(c))),
+    "begins in the middle of unloading": (REFUSED | UNLOADS, lambda c: np.arange((top(c) + len(c)) // 2, len(c))),
+    "one row each": (REFUSED | {"says": "row"}, lambda c: np.r_[top(c)]),
+}
+"""Plain campaigns of which rows are left out, or come twice."""
+CURVES = {
+    "force and displacement swapped": (SLIP, lambda c, _: Curve(c.time_s, c.displacement_um, c.force_mN)),
+    "approach only": (REFUSED, approach_alone),
+    "hold only": (REFUSED, hold_alone),
+    "readings in random order": (SUSPECT, shuffled),
+}
+"""Plain campaigns whose tests become others."""
+FORCES = {
+    "force in steps of a tenth of the peak": (READS, lambda f, _: np.round(f / (s := f.max() / 10.4)) * s),
+    "force in steps of 200 mN": (ANY, steps(200)),
+    "soft spheres, stresses of kPa, no threshold reached": (SUSPECT, times(1e-3)),
+    **{f"force times 1e{p}": (SLIP, times(10.0**p)) for p in (-14, -9, -6, -3, 3, 6, 9, 14)},
+    "force of the other sign": (SLIP, times(-1.0)),
+    "constant force": (REFUSED, constant(50.0)),
+    "force of two levels": (ANY, lambda f, _: np.where(f > f.max() / 2, f.max(), 0.0)),
+    "zero of force drifts": (ANY, lambda f, rng: f + np.linspace(0, rng.uniform(-0.3, 0.3) * f.max(), len(f))),
+    "force nothing but noise": (SUSPECT, lambda f, rng: noise(f, rng, 1)),
+    "loading that goes up and down": (ANY, lambda f, _: np.abs(f * (1 + 0.3 * np.sin(np.arange(len(f)))))),
+    "one spike of force, 1e6 mN": (ANY, lambda f, rng: spiked(f, rng, 1e6)),
+    "one spike of force, -1e4 mN": (ANY, lambda f, rng: spiked(f, rng, -1e4)),
+    "force stuck for a while": (ANY, stuck),
+    "force saturated at 80 %": (ANY, lambda f, _: np.minimum(f, 0.8 * f.max())),
+    "particle breaks: the force is gone": (
+        ANY,
+        lambda f, _: np.where(np.arange(len(f)) >= int(0.35 * len(f)), 0.1 * f, f),
+    ),
+    "not a number in force": (REFUSED | {"says": "nan"}, instead(np.nan)),
+    "all forces zero": (REFUSED | {"says": "zero"}, constant(0.0)),
+    "force and displacement of unlike lengths": (REFUSED | {"says": "entries"}, lambda f, _: f[:-3]),
+}
+DISPLACEMENTS = {
+    "displacement in steps of 1 um": (READS, steps(1.0)),
+    "all displacements below zero": (NEAR, lambda d, _: d - d.max() - 5),
+    "displacement from a far origin below zero": (NEAR, lambda d, _: d - 12_345.0),
+    "particle that snaps through": (ANY, snaps),
+    **{f"displacement times 1e{p}": (SLIP, times(10.0**p)) for p in (-14, -9, -6, -3, 3, 6, 9, 14)},
+    "displacement of the other sign": (SLIP, times(-1.0)),
+    "constant displacement": (REFUSED, constant(10.0)),
+    "zero of displacement drifts": (ANY, lambda d, rng: d + np.linspace(0, rng.uniform(-0.5, 0.5) * np.ptp(d), len(d))),
+    "displacement nothing but noise": (SUSPECT, lambda d, rng: noise(d, rng, 1)),
+    "displacement noise of a tenth of the range": (ANY, lambda d, rng: d + noise(d, rng, 0.1 * np.ptp(d))),
+    "one spike of displacement, 1e6 um": (ANY, lambda d, rng: spiked(d, rng, 1e6)),
+    "one spike of displacement, -1e6 um": (ANY, lambda d, rng: spiked(d, rng, -1e6)),
+    "ten spikes of twice the range": (ANY, lambda d, rng: spiked(d, rng, 2 * float(np.ptp(d)), 10)),
+    "displacement stuck for a while": (ANY, stuck),
+    "not a number in displacement": (REFUSED | {"says": "nan"}, instead(np.nan)),
+    "infinite displacement": (REFUSED | {"says": "inf"}, instead(np.inf)),
+}
+TIMES = {
+    "time in hours and starting late": (NEAR, lambda t, _: t / 3600 + 1e6),
+    "every time stamp twice": (NEAR, lambda t, _: np.repeat(t[::2], 2)[: len(t)]),
+    "one time stamp": (READS, constant(3.0)),
+    "a pause of a year": (NEAR, lambda t, _: t + np.where(np.arange(len(t)) > 60, 3e7, 0.0)),
+    **{f"time times 1e{p}": (READS, times(10.0**p)) for p in (-14, -6, 6, 9)},
+    "time that jumps once": (READS, lambda t, rng: np.sort(spiked(t, rng, 1e6))),
+    "time that starts again": (REFUSED | {"says": "time"}, lambda t, _: np.where(np.arange(len(t)) > 50, t - t[50], t)),
+}
+"""Plain campaigns of which one channel is changed."""
+BOTH = {
+    "force and displacement coarse": (READS, steps(5), steps(0.5)),
+    "both of the other sign": (SLIP, times(-1.0), times(-1.0)),
+    "constant force and displacement": (REFUSED, constant(5.0), constant(5.0)),
+    "noise larger than the signal": (SUSPECT, drowned, drowned),
+}
+"""Plain campaigns whose forces and displacements are changed."""
+FIRST = {
+    "force of the first particle times 1e6": (WEAK, first_changed(force_mN=times(1e6))),
+    "displacement of the first particle times 1e6": (SHORT, first_changed(displacement_um=times(1e6))),
+    "one test of two points": (READS, lambda c, _: first_of(rows(c, lambda one: np.r_[0, top(one)]), c)),
+    "one test of constant force": (READS, first_changed(force_mN=constant(50.0))),
+    "one test of constant displacement": (READS, first_changed(displacement_um=constant(10.0))),
+    "three particles of four unloading only": (UNLOADS, lambda c, _: first_of(c, rows(c, from_top))),
+    "one particle tested, all others below the threshold": (
+        ANY,
+        lambda c, rng: first_of(c, changed(c, rng, force_mN=times(1e-3))),
+    ),
+}
+"""Plain campaigns whose first test is not like the others."""
+
+
+def _kinds(table: dict, make: Callable[..., Campaign]) -> list[Kind]:
+    """The kinds of a table whose changes are made to a plain campaign by `make`."""
+    return [
+        Kind(name, lambda rng, changes=changes: make(plain(rng), rng, *changes), **facts)
+        for name, (facts, *changes) in table.items()
+    ]
+
+
+KINDS = [
+    *(Kind(name, make, **facts) for name, (facts, make) in WHOLE.items()),
+    *_kinds(SIZES, lambda c, _, change: replace(c, diameters_um=change(c.diameters_um))),
+    *_kinds(ROWS, lambda c, _, choose: rows(c, choose)),
+    *_kinds(CURVES, lambda c, rng, change: each(c, lambda one: change(one, rng))),
+    *_kinds(FORCES, lambda c, rng, change: changed(c, rng, force_mN=change)),
+    *_kinds(DISPLACEMENTS, lambda c, rng, change: changed(c, rng, displacement_um=change)),
+    *_kinds(TIMES, lambda c, rng, change: changed(c, rng, time_s=change)),
+    *_kinds(BOTH, lambda c, rng, first, second: changed(c, rng, displacement_um=second, force_mN=first)),
+    *_kinds(FIRST, lambda c, rng, change: change(c, rng)),
+]
+"""The catalogue, in order."""
 
 
 # ---- files damaged after they were written ---------------------------------------------------------------------------
-
-
-def lines_of(file: Path) -> list[str]:
-    return file.read_text(encoding="utf-8").splitlines()
-
-
-def damaged(name: str, file: str, says: str) -> Callable:
-    """A kind whose `file` is damaged: the function changes its lines."""
-
-    def add(change: Callable[[np.random.Generator, list[str]], list[str]]):
-        def damage(rng: np.random.Generator, folder: Path) -> None:
-            place = folder / file
-            place.write_text("\n".join(change(rng, lines_of(place))) + "\n", encoding="utf-8")
-
-        KINDS.append(Kind(f"file: {name}", plain, refused=True, says=says, damage=damage))
-        return change
-
-    return add
 
 
 def _with(lines: list[str], row: int, cell: int, text: str) -> list[str]:
@@ -750,58 +402,48 @@ def _with(lines: list[str], row: int, cell: int, text: str) -> list[str]:
     return [*lines[:row], ",".join(cells), *lines[row + 1 :]]
 
 
-@damaged("a force that is text", "curves.csv", "row")
-def _(rng, lines):
-    return _with(lines, int(rng.integers(1, len(lines))), 2, "overload")
+def _any(rng, lines: list[str], first: int = 1) -> int:
+    return int(rng.integers(first, len(lines)))
 
 
-@damaged("a displacement of 1e300", "curves.csv", "row")
-def _(rng, lines):
-    return _with(lines, int(rng.integers(1, len(lines))), 3, "1e300")
-
-
-@damaged("a cell too few", "curves.csv", "row")
-def _(rng, lines):
-    row = int(rng.integers(1, len(lines)))
+def _cut_cell(rng, lines: list[str]) -> list[str]:
+    row = _any(rng, lines)
     return [*lines[:row], lines[row].rsplit(",", 1)[0], *lines[row + 1 :]]
 
 
-@damaged("cut off in the middle of a row", "curves.csv", "row")
-def _(rng, lines):
-    row = int(rng.integers(20, len(lines)))
+def _cut_row(rng, lines: list[str]) -> list[str]:
+    row = _any(rng, lines, 20)
     return [*lines[:row], lines[row][:8]]
 
 
-@damaged("the header is gone", "curves.csv", "row 1")
-def _(rng, lines):
-    return lines[1:]
+# Name, file, what the error must name, and what becomes of the lines.
+DAMAGES = [
+    ("a force that is text", "curves.csv", "row", lambda rng, x: _with(x, _any(rng, x), 2, "overload")),
+    ("a displacement of 1e300", "curves.csv", "row", lambda rng, x: _with(x, _any(rng, x), 3, "1e300")),
+    ("a cell too few", "curves.csv", "row", _cut_cell),
+    ("cut off in the middle of a row", "curves.csv", "row", _cut_row),
+    ("the header is gone", "curves.csv", "row 1", lambda _, x: x[1:]),
+    ("no rows", "curves.csv", "curves.csv", lambda _, x: x[:1]),
+    ("a particle without sizes", "particles.csv", "particles.csv", lambda _, x: x[:-1]),
+    ("a diameter of zero", "particles.csv", "row", lambda _, x: _with(x, 2, 1, "0")),
+    ("an unknown unit", "curves.csv", "column", lambda _, x: [x[0].replace("force_mN", "force_kN3"), *x[1:]]),
+    (
+        "rows of two tests mixed up",
+        "curves.csv",
+        "time",
+        lambda rng, x: [x[0], *np.array(x[1:])[rng.permutation(len(x) - 1)].tolist()],
+    ),
+    ("nonsense in addition", "campaign.toml", "campaign.toml", lambda _, x: [*x, "control = ["]),
+]
 
 
-@damaged("no rows", "curves.csv", "curves.csv")
-def _(rng, lines):
-    return lines[:1]
+def _damaged(name: str, file: str, says: str, change: Callable) -> Kind:
+    def damage(rng: np.random.Generator, folder: Path) -> None:
+        place = folder / file
+        lines = place.read_text(encoding="utf-8").splitlines()
+        place.write_text("\n".join(change(rng, lines)) + "\n", encoding="utf-8")
+
+    return Kind(f"file: {name}", plain, refused=True, says=says, damage=damage)
 
 
-@damaged("a particle without sizes", "particles.csv", "particles.csv")
-def _(rng, lines):
-    return lines[:-1]
-
-
-@damaged("a diameter of zero", "particles.csv", "row")
-def _(rng, lines):
-    return _with(lines, 2, 1, "0")
-
-
-@damaged("an unknown unit", "curves.csv", "column")
-def _(rng, lines):
-    return [lines[0].replace("force_mN", "force_kN3"), *lines[1:]]
-
-
-@damaged("rows of two tests mixed up", "curves.csv", "time")
-def _(rng, lines):
-    return [lines[0], *np.array(lines[1:])[rng.permutation(len(lines) - 1)].tolist()]
-
-
-@damaged("nonsense beside it", "campaign.toml", "campaign.toml")
-def _(rng, lines):
-    return [*lines, "control = ["]
+KINDS += [_damaged(*row) for row in DAMAGES]

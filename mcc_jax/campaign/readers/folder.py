@@ -11,15 +11,16 @@ from __future__ import annotations
 import hashlib
 import re
 import shlex
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from ..._errors import InputError
+from ..._format import first_few
 from ..findings import Finding
-from ..schema import Control, Curve
+from ..schema import Control
 from ..table import read_bytes, same_text
 from .text import Tests
 
@@ -37,9 +38,7 @@ _SHOWN = 6
 
 def names_of(file: Path) -> tuple[str, ...]:
     """The names under which a table may hold a file: with its ending, in capitals or not, and without."""
-    return tuple(
-        dict.fromkeys((file.name, file.stem + file.suffix.lower(), file.stem + file.suffix.upper(), file.stem))
-    )
+    return file.name, file.stem + file.suffix.lower(), file.stem + file.suffix.upper(), file.stem
 
 
 def passed_over(name: str) -> bool:
@@ -56,59 +55,53 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 def read_folder(
     folder: Path, read: Callable[[Path, bytes], Tests], skip: Sequence[str]
 ) -> tuple[Tests, dict[str, tuple[str, ...]], list[Finding]]:
-    """The tests of all files of a folder.
+    """The tests of all files but those of `skip`, by name or a pattern with "*" and "?"; `read` reads one file.
 
+    In addition by the name of each test the names under which a table may hold its diameters, and what was left out.
     Raises `InputError` if there is no file, a file cannot be read, two tests have one name, or `skip` fits no file.
-
-    Args:
-        read: reads the bytes of one file.
-        skip: names of files, with or without ending, or patterns with "*" and "?", that are left out.
-
-    Returns:
-        The tests; by the name of each the names under which a table may hold its diameters; and what was left out.
     """
     files, findings = _files(folder, skip)
     found: dict[Path, Tests] = {}
     failed: dict[Path, InputError] = {}
-    same: dict[str, list[Path]] = {}
+    same: defaultdict[str, list[Path]] = defaultdict(list)
     for file in files:
         try:
             file.name.encode("utf-8")  # a name in another encoding than the system's cannot be written into a file
             data = read_bytes(file)
             found[file] = read(file, data)
-            same.setdefault(hashlib.sha256(data).hexdigest(), []).append(file)
+            same[hashlib.sha256(data).hexdigest()].append(file)
         except UnicodeEncodeError:
             failed[file] = InputError("the file's name is no Unicode text", file=file, remedy="Rename it")
         except InputError as error:
             failed[file] = error
     if failed:
         raise _unreadable(failed, len(files))
-    findings += [_twice(each) for each in same.values() if len(each) > 1]
+    for each in same.values():
+        if len(each) > 1:
+            sentence = f"{_listed(each)} hold the same bytes, so one test counts {len(each)} times"
+            remedy = f"If it is one particle, leave it out with {_leave_out(each[1:])}"
+            names = tuple(same_text(file.stem) for file in each)
+            findings.append(Finding("duplicates", "warning", sentence, remedy, names))
+    form = f"{_count(files)}, {' and '.join(sorted({tests.format for tests in found.values()}))}"
+    whole = Tests({}, form, _control(found), _other(found))
     own = Counter(name for tests in found.values() for name in tests.curves)
-    curves: dict[str, Curve] = {}
     keys: dict[str, tuple[str, ...]] = {}
-    sizes: dict[str, list[float] | InputError] = {}
-    missing: dict[str, int] = {}
     origin: dict[str, Path] = {}
     for file, tests in found.items():
-        stem = same_text(file.stem)
         for name, curve in tests.curves.items():
-            full = stem if len(tests.curves) == 1 else f"{stem}-{name}"
-            if full in curves:
+            full = same_text(file.stem) if len(tests.curves) == 1 else f"{same_text(file.stem)}-{name}"
+            if full in origin:
                 problem = f"this file and {origin[full].name} both give a test the name {full!r}"
-                remedy = f"Rename one of them, or leave one out with --leave-out {shlex.quote(file.name)}"
-                raise InputError(problem, file=file, remedy=remedy)
-            curves[full], origin[full] = curve, file
+                raise InputError(
+                    problem, file=file, remedy=f"Rename one of them, or leave one out with {_leave_out([file])}"
+                )
+            whole.curves[full], origin[full] = curve, file
             keys[full] = (full, *names_of(file), *([name] if own[name] == 1 else []))
             if (size := tests.diameters_um.get(name)) is not None:
-                sizes[full] = (
-                    size if isinstance(size, list) else _or_skip(size, f"--leave-out {shlex.quote(file.name)}")
-                )
+                whole.diameters_um[full] = size if isinstance(size, list) else _or_skip(size, [file])
             if name in tests.missing:
-                missing[full] = tests.missing[name]
-    formats = sorted({tests.format for tests in found.values()})
-    form = f"{_count(files)}, {' and '.join(formats)}"
-    return Tests(curves, form, _control(found), _other(found), sizes, missing), keys, findings
+                whole.missing[full] = tests.missing[name]
+    return whole, keys, findings
 
 
 def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]]:
@@ -122,27 +115,21 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
         raise InputError("is a campaign already", file=folder, remedy="Give the folder with the instrument files")
     quiet = [entry for entry in entries if entry not in inside and passed_over(entry.name)]
     rest = [entry for entry in entries if entry not in inside and entry not in quiet]
-    skipped: list[Path] = []
     for pattern in skip:
-        fitting = [entry for entry in rest if _fits(entry, pattern)]
-        if not fitting and not any(_fits(entry, pattern) for entry in quiet):
+        if not any(_fits(entry, pattern) for entry in (*rest, *quiet)):
             problem = f"--leave-out {shlex.quote(pattern)} fits no file"
             raise InputError(problem, file=folder, remedy="Give a name as in the folder, or a pattern")
-        skipped += [entry for entry in fitting if entry not in skipped]
+    skipped = list(dict.fromkeys(entry for pattern in skip for entry in rest if _fits(entry, pattern)))
     files = [entry for entry in rest if entry not in skipped]
     if not files:
         below = f"; give one of the folders in it: {_listed(inside)}" if inside else ""
         raise InputError("there is no instrument file in the folder", file=folder, remedy=f"Check the path{below}")
-    findings = []
-    if quiet:
-        sentence = f"{_count(quiet)} ignored because of the name: {_listed(quiet)}"
-        findings.append(Finding("files", "info", sentence))
-    if inside:
-        what = "1 folder" if len(inside) == 1 else f"{len(inside)} folders"
-        findings.append(Finding("files", "info", f"{what} in it not entered: {_listed(inside)}"))
-    if skipped:
-        findings.append(Finding("files", "info", f"{_count(skipped)} skipped as asked: {_listed(skipped)}"))
-    return files, findings
+    sentences = {
+        f"{_count(quiet)} ignored because of the name: {_listed(quiet)}": quiet,
+        f"{_count(inside, 'folder')} in it not entered: {_listed(inside)}": inside,
+        f"{_count(skipped)} skipped as asked: {_listed(skipped)}": skipped,
+    }
+    return files, [Finding("files", "info", sentence) for sentence, some in sentences.items() if some]
 
 
 def _fits(entry: Path, pattern: str) -> bool:
@@ -150,55 +137,42 @@ def _fits(entry: Path, pattern: str) -> bool:
     return wanted in (name, stem) or fnmatchcase(name, wanted)
 
 
-def _count(files: Sequence[Path]) -> str:
-    return "1 file" if len(files) == 1 else f"{len(files)} files"
+def _count(files: Sequence[Path], what: str = "file") -> str:
+    return f"1 {what}" if len(files) == 1 else f"{len(files)} {what}s"
 
 
-def _listed(files: Sequence[Path]) -> str:
-    names = ", ".join(file.name for file in files[:_SHOWN]) + (", ..." if len(files) > _SHOWN else "")
+def _listed(files: Iterable[Path]) -> str:
+    names = first_few((file.name for file in files), _SHOWN)
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in names)
+
+
+def _leave_out(files: Iterable[Path]) -> str:
+    """The options of the command that leave files out."""
+    return " ".join(f"--leave-out {shlex.quote(file.name)}" for file in files)
 
 
 def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
     error = next(iter(failed.values()))
-    names = [file.name for file in failed]
     if len(failed) == files:
         more = f". All {files} files fail in the same way" if files > 1 else ""
-        remedy = (error.remedy or "").rstrip(".") + more
-        return error.changed(remedy=remedy)
-    shown = " ".join(f"--leave-out {shlex.quote(name)}" for name in names[:_SHOWN])
-    others = f" ({len(names)} of {files} files cannot be read)" if len(names) > 1 else ""
-    rest = " ..." if len(names) > _SHOWN else ""
-    return _or_skip(error, shown + rest, others)
+        return error.changed(remedy=(error.remedy or "").rstrip(".") + more)
+    return _or_skip(error, list(failed), f" ({len(failed)} of {files} files cannot be read)" if len(failed) > 1 else "")
 
 
-def _or_skip(error: InputError, how: str, others: str = "") -> InputError:
-    """The same error, with the way to leave the file out."""
+def _or_skip(error: InputError, files: Sequence[Path], others: str = "") -> InputError:
+    """The same error, with the way to leave the files out."""
+    how = _leave_out(files[:_SHOWN]) + (" ..." if len(files) > _SHOWN else "")
     remedy = ", ".join([*([error.remedy.rstrip(".")] if error.remedy else []), f"or leave it out{others} with {how}"])
     return error.changed(remedy=remedy)
 
 
-def _twice(files: Sequence[Path]) -> Finding:
-    rest = " ".join(f"--leave-out {shlex.quote(file.name)}" for file in files[1:])
-    return Finding(
-        "duplicates",
-        "warning",
-        f"{_listed(files)} hold the same bytes, so one test counts {len(files)} times",
-        f"If it is one particle, leave it out with {rest}",
-        tuple(same_text(file.stem) for file in files),
-    )
-
-
 def _control(found: dict[Path, Tests]) -> Control | None:
     """The controlled quantity, if it is the same for all; where one file does not say, it is not known."""
-    by: dict[Control | None, Path] = {}
-    for file, tests in found.items():
-        by.setdefault(tests.control, file)
+    by = {tests.control: file for file, tests in reversed(found.items())}  # the first of each
     if "load" in by and "displacement" in by:
         problem = f"the test is controlled by displacement, that of {by['load'].name} by load"
-        raise InputError(
-            problem, file=by["displacement"], remedy="Convert tests of two kinds separately, with --leave-out"
-        )
+        remedy = "Convert tests of two kinds separately, with --leave-out"
+        raise InputError(problem, file=by["displacement"], remedy=remedy)
     return next(iter(by)) if len(by) == 1 else None
 
 

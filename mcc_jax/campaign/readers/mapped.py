@@ -6,11 +6,9 @@ import contextlib
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -19,21 +17,26 @@ from ..columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
 from ..schema import Curve
 from ..table import (
     APOSTROPHES,
+    binary_kind,
     filled,
     number_of_cells,
     parse_number,
     same_text,
+    split,
     thousands_for_decimals,
     thousands_mark,
 )
 from ..validate import check_magnitudes
+from ..workbook import is_workbook, read_sheet
 from .diameters import check_triple
 from .mapping import DIMENSIONS, MappingFile
-from .text import Rows, Tests, checked_curve, read_rows
+from .text import Tests, checked_curve, decode_lines
 
 _FURTHEST = 200
 """Rows above a header found by `begin`, within which it is sought again; an instrument's preamble has a few dozen."""
 _OWN_DIAMETER = "Add it to the file, or give this test's diameters in a table by --diameters"
+
+_Reading = float | None  # NaN where it is marked as missing, None where the cell holds something else
 
 
 def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
@@ -41,8 +44,8 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
 
     Raises `InputError` if the file does not hold what the mapping says, or a cell is damaged.
     """
-    reader = _Reader(read_rows(data, file, mapping), file, mapping)
-    reader.run()
+    reader = _Reader(_Rows(data, file, mapping), file, mapping)
+    reader.read()
     if not reader.samples:
         if reader.missing:
             raise reader.wrong("every row has a missing reading", f"Check missing in {mapping.file.name}")
@@ -52,72 +55,129 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     for name in reader.missing:
         if name not in reader.samples:
             raise reader.wrong(f"every row of the test {name!r} has a missing reading", "Remove the test's rows")
-    again = reader.header_came_again
-    curves = {name: _curve(name, rows, mapping, file, again) for name, rows in reader.samples.items()}
+    reader.refuse_groups()
+    curves = {name: reader.curve(name) for name in reader.samples}
     other = {"mapping_provenance": mapping.provenance} if mapping.provenance else {}
     form = f"mapped by {mapping.file.name}"
     return Tests(curves, form, mapping.control, other, reader.diameters_um, dict(reader.missing))
 
 
-_Sample = tuple[int, int, list[float]]  # its row in the file, the row's number in the test, and the readings
-_Reading = float | None  # NaN where it is marked as missing, None where the cell holds something else
+class _Rows:
+    """Rows of a table, lines of text or the cells of a workbook's sheet; text is split when it is asked for."""
+
+    def __init__(self, data: bytes, file: Path, mapping: MappingFile) -> None:
+        self.file, self.mapping, self.delimiter = file, mapping.file.name, mapping.delimiter
+        self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
+        self.rows: list[str] | list[list[str]]
+        if is_workbook(data):
+            how = f'Write sheet = "..." in {mapping.file.name}'
+            self.rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
+            return
+        if mapping.sheet is not None:
+            problem = f"is no Excel workbook (xlsx), though {mapping.file.name} names a sheet"
+            raise InputError(problem, file=file, remedy="Remove the key sheet, or save the file as xlsx")
+        kind = binary_kind(data)
+        if kind is not None and not mapping.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32")):
+            remedy = "Unpack it, save it as xlsx or text, or name its encoding"
+            raise InputError(f"the file is {kind}", file=file, remedy=remedy)
+        first, *others = decode_lines(data, mapping.encoding, file)
+        self.rows = [first.removeprefix("\ufeff"), *others]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def line(self, i: int) -> str:
+        """A row as one text."""
+        row = self.rows[i]
+        return row if isinstance(row, str) else "\t".join(row)
+
+    def blank(self, i: int) -> bool:
+        """Whether a row holds nothing but delimiters."""
+        return not self.line(i).strip(self.nothing)
+
+    def begins(self, i: int, text: str | None) -> bool:
+        """Whether a row, or the first thing that it holds, begins with a text, if there is one."""
+        if text is None:
+            return False
+        line, text = same_text(self.line(i).lstrip()), same_text(text)
+        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
+
+    def cells(self, i: int) -> list[str]:
+        """The cells of a row."""
+        row = self.rows[i]
+        if not isinstance(row, str):
+            return row
+        if self.delimiter == " ":
+            return row.split()
+        if '"' not in row:
+            return row.split(self.delimiter)
+        try:
+            return split(row, self.file, self.delimiter)[0][0]
+        except InputError as error:
+            remedy = f"Close every double quote, or correct delimiter in {self.mapping}"
+            raise error.changed(row=i + 1, remedy=remedy) from None
 
 
-@dataclass
 class _Reader:
     """Goes through the rows once and keeps what belongs to each test."""
 
-    rows: Rows
-    file: Path
-    mapping: MappingFile
-    samples: dict[str, list[_Sample]] = field(default_factory=dict)
-    missing: Counter[str] = field(default_factory=Counter)
-    diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)
-    between: bool = False  # whether the next sample begins a test
-    header_came_again: bool = False
+    def __init__(self, rows: _Rows, file: Path, mapping: MappingFile) -> None:
+        self.rows, self.file, self.mapping = rows, file, mapping
+        # Of each test the index of a sample's row, its number in the test, and the readings.
+        self.samples: dict[str, list[tuple[int, int, list[_Reading]]]] = {}
+        self.missing: Counter[str] = Counter()
+        self.diameters_um: dict[str, list[float] | InputError] = {}
+        self.between = False  # whether the next sample begins a test
+        self.header_came_again = False
 
     def wrong(self, problem: str, remedy: str, i: int | None = None, column: str | int | None = None) -> InputError:
         """The error for the file, or for its row of index `i`."""
         row, named = None if i is None else i + 1, None if column is None else str(column)
         return InputError(problem, file=self.file, row=row, column=named, remedy=remedy)
 
-    def run(self) -> None:
+    def read(self) -> None:
         """Read all rows. Raises `InputError` at the first row that is neither sample, header nor footer."""
         rows, mapping = self.rows, self.mapping
         head = self._head()
+        i = head + mapping.header_rows
         self.header = rows.cells(head) if mapping.header_rows and head < len(rows) else None
-        self.stop = self._stop(head + mapping.header_rows)
-        self.where = {name: self._place(column.column, head) for name, column in mapping.sources.items()}
+        self.stop = self._stop(i)
+        self.where = {name: self._place(source.column, head) for name, source in mapping.sources.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
-        self.width, self.raw_width = self._widths(head)
+        first = self.header
+        if first is None:
+            first = next((rows.cells(j) for j in range(head, self.stop) if not rows.blank(j)), [])
+        needed = max(self.where.values()) + 1
+        # The cells that a row must have: without and with what is empty behind the last column.
+        self.width, self.raw_width = max(needed, filled(first)), max(needed, len(first))
         sizes = self._diameters(0, head)
         block, ended = 1, False
-        i = head + mapping.header_rows
         while i < self.stop:
             if rows.blank(i):
                 self.between = self.between or mapping.tests == "blank line"
                 ended = ended and mapping.tests != "blank line"
-            elif mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
+            elif rows.begins(i, mapping.comment_prefix):
                 pass
-            elif None in (readings := self._readings(i)) and (below := self._rows_above_again(i)) is not None:
-                sizes = self._diameters(i, below)
-                i = below - 1
-            elif None in readings and (again := self._header_again(i)) is not None:
-                if mapping.tests == "file" and mapping.pace is not None:
+            elif None in (readings := self._readings(i)) and (below := self._begins_again(i)) is not None:
+                top = below - mapping.header_rows
+                if self.header is not None and mapping.tests == "file" and mapping.pace is not None:
                     remedy = f'Write tests = "header" in {mapping.file.name}'
-                    raise self.wrong("the header comes again, so this is more than one test", remedy, again)
-                sizes = self._diameters(i, again) if again > i else sizes
+                    raise self.wrong("the header comes again, so this is more than one test", remedy, top)
+                sizes = self._diameters(i, top) if top > i else sizes
                 self.between, ended = self.between or mapping.tests == "header", False
-                self.header_came_again = True
-                i = again + mapping.header_rows - 1
+                self.header_came_again = self.header is not None
+                i = below - 1
             else:
-                ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
+                ended = ended or rows.begins(i, mapping.end)
                 if not ended:
                     if mapping.tests in ("blank line", "header"):
-                        block += self.between and bool(self.samples or self.missing)
+                        block += self.between and self._has_data
                     self._take(i, readings, block, sizes)
             i += 1
-        self._refuse_groups()
+
+    @property
+    def _has_data(self) -> bool:
+        return bool(self.samples or self.missing)
 
     def _take(self, i: int, readings: list[_Reading], block: int, sizes: list[float] | InputError | None) -> None:
         """Keep a row of data, of the test of this number where the file does not name it, with its diameters."""
@@ -130,28 +190,10 @@ class _Reader:
         if missing:
             self.missing[name] += 1
         else:
-            rows = self.samples.setdefault(name, [])
-            rows.append((i + 1, len(rows) + self.missing[name], cast(list[float], readings)))
+            samples = self.samples.setdefault(name, [])
+            samples.append((i, len(samples) + self.missing[name], readings))
         if sizes is not None:
             self.diameters_um.setdefault(name, sizes)
-
-    def _refuse_groups(self) -> None:
-        """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
-        if self.mapping.thousands is not None or not isinstance(self.rows.rows[0], str):
-            return
-        mark = self.mapping.decimal_mark
-        for quantity in self.wanted:
-            place = self.where[quantity]
-            taken = (row for samples in self.samples.values() for row, _, _ in samples)
-            found = thousands_for_decimals(((row, self.rows.cells(row - 1)[place]) for row in taken), mark)
-            if found is not None:
-                row, problem = found
-                word, other = ("point", ",") if mark == "." else ("comma", ".")
-                remedy = (
-                    f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
-                    'thousands = "none" if it is a decimal mark'
-                )
-                raise self.wrong(problem, remedy, row - 1, self.mapping.sources[quantity].column)
 
     def _head(self) -> int:
         """The index of the header, or of the first row of data where there is none."""
@@ -169,7 +211,7 @@ class _Reader:
             if self.header is not None and column > len(self.header):
                 raise self.wrong(f"there is no column {column}, only {len(self.header)}", "Count again", head)
             return column - 1
-        names = [same_text(name).strip() for name in self.header or []]
+        names = _names(self.header or [])
         found = [i for i, name in enumerate(names) if name == same_text(column)]
         if len(found) == 1:
             return found[0]
@@ -186,55 +228,43 @@ class _Reader:
             remedy = f"There are: {known}; if this is not the header, correct skip_rows or begin in {file}"
         raise self.wrong(f"there is no column {column!r}", remedy, head)
 
-    def _stop(self, body: int) -> int:
+    def _stop(self, start: int) -> int:
         """The index behind the last row, without the footer."""
-        full = [i for i in range(body, len(self.rows)) if not self.rows.blank(i)]
         footer = self.mapping.skip_footer
-        return full[-footer] if 0 < footer < len(full) else body if footer and footer >= len(full) else len(self.rows)
+        full = [start, *(i for i in range(start, len(self.rows)) if not self.rows.blank(i))]
+        return full[max(-footer, -len(full))] if footer else len(self.rows)
 
-    def _widths(self, head: int) -> tuple[int, int]:
-        """The number of cells that a row must have: without and with what is empty behind the last column."""
-        first = self.header
-        if first is None:
-            first = next((self.rows.cells(i) for i in range(head, self.stop) if not self.rows.blank(i)), [])
-        needed = max(self.where.values()) + 1
-        return max(needed, filled(first)), max(needed, len(first))
-
-    def _header_again(self, i: int) -> int | None:
-        """The index of the header if it comes again at this row, or below rows that are no samples; else None."""
+    def _begins_again(self, i: int) -> int | None:
+        """The index of the row below, if the rows above the first sample, or those like them, come again at a row."""
         rows, mapping = self.rows, self.mapping
-        if self.header is None:
-            return None
         above = (mapping.skip_rows or 0) if mapping.begin is None else _FURTHEST
         for j in range(i, min(i + above + 1, self.stop)):
-            if mapping.begin is not None and rows.begins(j, mapping.begin):
-                return self._same_columns(j)
-            if mapping.begin is None and not rows.blank(j) and rows.cells(j) == self.header:
-                return j
-            if self._is_sample(j):
+            if self.header is None:
+                if not self.between or not self._has_data:
+                    return None
+                readings = self._readings(j)
+                if None not in readings:
+                    return j
+                if any(number is not None and number == number for number in readings):
+                    return None
+            elif rows.begins(j, mapping.begin):
+                self._check_columns(j)
+                return j + mapping.header_rows
+            elif mapping.begin is None and not rows.blank(j) and rows.cells(j) == self.header:
+                return j + mapping.header_rows
+            elif self._is_sample(j):
                 return None
         return None
 
-    def _rows_above_again(self, i: int) -> int | None:
-        """The index of a test's first sample if rows like those above the first test, without a header, precede it."""
-        if self.header is not None or not self.between or not (self.samples or self.missing):
-            return None
-        for j in range(i, min(i + (self.mapping.skip_rows or 0) + 1, self.stop)):
-            if self._is_sample(j):
-                return j
-            if any(number is not None and number == number for number in self._readings(j)):
-                return None
-        return None
-
-    def _same_columns(self, i: int) -> int:
+    def _check_columns(self, i: int) -> None:
         """Refuse a header that begins like the first and names the columns in another order."""
-        names = [same_text(name).strip() for name in self.rows.cells(i)]
+        names, first = _names(self.rows.cells(i)), _names(self.header or [])
         for place in self.where.values():
-            first = same_text((self.header or [])[place]).strip()
-            if place >= len(names) or names[place] != first:
-                problem = f"the header comes again without {first!r} as its column {place + 1}"
-                raise self.wrong(problem, "Put tests with other columns into a file of their own", i)
-        return i
+            if place >= len(names) or names[place] != first[place]:
+                problem = f"the header comes again without {first[place]!r} as its column {place + 1}"
+                raise self.wrong(problem, "Put tests with other columns into a separate file", i)
+
+    # ---- cells -------------------------------------------------------------------------------------------------------
 
     def _readings(self, i: int) -> list[_Reading]:
         """The readings of a row, as numbers without a unit."""
@@ -243,12 +273,22 @@ class _Reader:
         return [self._reading(cells[place]) if place < len(cells) else None for place in places]
 
     def _reading(self, cell: str) -> _Reading:
-        texts, numbers = self.missing_marks
+        texts, numbers = self._missing_marks
         try:
             number = self._number(cell)
         except ValueError:
-            return math.nan if cell.strip().lower() in texts else None
+            number = None
         return math.nan if number in numbers or (texts and cell.strip().lower() in texts) else number
+
+    @cached_property
+    def _missing_marks(self) -> tuple[set[str], set[float]]:
+        """Texts, and numbers, that mean that there is no reading."""
+        texts, numbers = set[str](), set[float]()
+        for mark in self.mapping.missing or ():
+            texts.add(str(mark).strip().lower())  # TOML has a number nan, which equals nothing, itself included
+            with contextlib.suppress(ValueError):
+                numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
+        return texts, numbers
 
     def _is_sample(self, i: int) -> bool:
         """Whether every reading of a row is a number, or marked as missing."""
@@ -274,7 +314,7 @@ class _Reader:
         if self._is_footer(i):
             remedy = self._footer_remedy(i)
         elif count > self.width and self.mapping.delimiter == self.mapping.decimal_mark:
-            remedy = "Quote every number that has a decimal comma, or part the columns by another character"
+            remedy = "Quote every number that has a decimal comma, or separate the columns by another character"
         elif count > self.width:
             remedy = f"Check delimiter and decimal_mark in {name}, and quote text that holds the delimiter"
         else:
@@ -285,22 +325,12 @@ class _Reader:
         """The error for the cell of a row that should hold a reading."""
         quantity = self.wanted[which]
         cell = cells[self.where[quantity]]
-        remedy = self._number_remedy(cell.strip(), i)
         try:
             self._number(cell)
         except ValueError as error:
-            return self.wrong(str(error), remedy, i, self.mapping.sources[quantity].column)
+            column = self.mapping.sources[quantity].column
+            return self.wrong(str(error), self._number_remedy(cell.strip(), i), i, column)
         raise AssertionError
-
-    @cached_property
-    def missing_marks(self) -> tuple[set[str], set[float]]:
-        """Texts, and numbers, that mean that there is no reading."""
-        texts, numbers = set[str](), set[float]()
-        for mark in self.mapping.missing or ():
-            texts.add(str(mark).strip().lower())  # TOML has a number nan, which equals nothing, itself included
-            with contextlib.suppress(ValueError):
-                numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
-        return texts, numbers
 
     def _number_remedy(self, cell: str, i: int) -> str:
         """What to do about a cell that is no number, by what it looks like."""
@@ -316,19 +346,18 @@ class _Reader:
             return f'If the mark separates thousands, write thousands = "{word}"{other} in {name}'
         if self._is_footer(i):
             return self._footer_remedy(i)
-        word = any(c.isalpha() for c in cell) and not _is_no_reading(cell)
-        if word and not (self.samples or self.missing):
-            return f"If this row belongs to the header, correct skip_rows or header_rows in {name}"
-        if word and self.between:
-            return f"If the rows above this test are not those above the first, name the header with begin in {name}"
         if _is_no_reading(cell):
             return f"Correct the cell, or write missing = [{_quoted(cell)}] in {name} to drop such readings"
+        if any(c.isalpha() for c in cell) and not self._has_data:
+            return f"If this row belongs to the header, correct skip_rows or header_rows in {name}"
+        if any(c.isalpha() for c in cell) and self.between:
+            return f"If the rows above this test are not those above the first, name the header with begin in {name}"
         return f"Correct the cell, or decimal_mark and unit in {name}"
 
     def _is_footer(self, i: int) -> bool:
         """Whether a row that begins with text has samples above and, in its test, none below."""
         text = _first(self.rows.cells(i))
-        if not (self.samples or self.missing) or self._is_number(text) or _is_no_reading(text):
+        if not self._has_data or self._is_number(text) or _is_no_reading(text):
             return False
         stop = self.stop if self.between else self._end_of_test(i)
         return not any(self._is_sample(j) for j in range(i, stop))
@@ -343,6 +372,8 @@ class _Reader:
         if below[-1] < self._end_of_test(i):
             way += f" or skip_footer = {len(below) + self.mapping.skip_footer}"
         return f"If the samples end above it, write {way} in {self.mapping.file.name}"
+
+    # ---- what a test holds besides its readings ----------------------------------------------------------------------
 
     def _name(self, cells: list[str], block: int, i: int) -> str:
         match self.mapping.tests:
@@ -379,16 +410,14 @@ class _Reader:
             if rest[:1].isalnum():
                 continue
             words = rest.replace(":", " ").replace("=", " ").split()
-            units = [w.strip("[]()") for w in words if not self._is_number(w)]
-            numbers = [w for w in words if self._is_number(w)]
+            numbers = [word for word in words if self._is_number(word)]
+            units = [word.strip("[]()") for word in words if word not in numbers]
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise self.wrong(problem, _OWN_DIAMETER, i)
-            value, factor = self._number(numbers[0]), self.mapping.diameter_factor
+            value = self._number(numbers[0])
             try:
-                if factor is None and not units:
-                    raise ValueError("the unit is missing")  # noqa: TRY301
-                factor = unit_factor(units[0], LENGTH) if factor is None else factor
+                factor = self.mapping.diameter_factor or unit_factor("".join(units[:1]), LENGTH)
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
                 raise self.wrong(str(error), remedy, i, name) from None
@@ -397,8 +426,53 @@ class _Reader:
             return float(convert(np.array([value]), factor)[0])
         raise self.wrong(f"no row above the samples begins with {name!r}, for the diameter", _OWN_DIAMETER)
 
+    # ---- tests -------------------------------------------------------------------------------------------------------
+
+    def refuse_groups(self) -> None:
+        """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
+        if self.mapping.thousands is not None or not isinstance(self.rows.rows[0], str):
+            return
+        mark = self.mapping.decimal_mark
+        taken = [i for samples in self.samples.values() for i, _, _ in samples]
+        for quantity in self.wanted:
+            found = thousands_for_decimals([self.rows.cells(i)[self.where[quantity]] for i in taken], mark)
+            if found is not None:
+                word, other = ("point", ",") if mark == "." else ("comma", ".")
+                remedy = (
+                    f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
+                    'thousands = "none" if it is a decimal mark'
+                )
+                raise self.wrong(found[1], remedy, taken[found[0]], self.mapping.sources[quantity].column)
+
+    def curve(self, name: str) -> Curve:
+        """A test in canonical units."""
+        mapping, file = self.mapping, self.file
+        at = [i for i, _, _ in self.samples[name]]
+        rows = [i + 1 for i in at]
+        raw = np.array([readings for _, _, readings in self.samples[name]], float).T
+        columns: dict[str, np.ndarray] = {}
+        for quantity, values in zip(self.wanted, raw, strict=True):
+            source = mapping.sources[quantity]
+            columns[quantity] = source.sign * convert(np.ascontiguousarray(values), source.factor)
+            check_magnitudes(columns[quantity], file, rows, str(source.column))
+        if mapping.pace is not None:
+            order = np.array([order for _, order, _ in self.samples[name]])
+            columns["time"] = mapping.pace.times(columns["displacement"], order)
+            check_magnitudes(columns["time"], file, rows, "time")
+        back = np.flatnonzero(np.diff(columns["time"]) < 0)
+        if len(back) and mapping.tests == "file":
+            before, here = at[int(back[0])], at[int(back[0]) + 1]
+            way = "header" if self.header_came_again else "blank line" if here > before + 1 else "column"
+            remedy = f'If another test begins here, write tests = "{way}" in {mapping.file.name} or split the file'
+            raise self.wrong(f"the time of test {name!r} goes back", remedy, here)
+        return checked_curve(columns["time"], columns["force"], columns["displacement"], file, at, name)
+
 
 _CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2}:[0-9]{2}(?::[0-9.]+)?.*")
+
+
+def _names(header: list[str]) -> list[str]:
+    return [same_text(name).strip() for name in header]
 
 
 def _first(cells: list[str]) -> str:
@@ -417,26 +491,3 @@ def _is_no_reading(cell: str) -> bool:
         return abs(float(cell.replace(",", "."))) > LARGEST_MAGNITUDE
     except ValueError:
         return False
-
-
-def _curve(name: str, rows: list[_Sample], mapping: MappingFile, file: Path, again: bool) -> Curve:
-    wanted = [quantity for quantity in DIMENSIONS if quantity in mapping.sources]
-    raw = np.array([numbers for _, _, numbers in rows]).T
-    at = [row for row, _, _ in rows]
-    columns: dict[str, np.ndarray] = {}
-    for quantity, values in zip(wanted, raw, strict=True):
-        column = mapping.sources[quantity]
-        columns[quantity] = column.sign * convert(np.ascontiguousarray(values), column.factor)
-        check_magnitudes(columns[quantity], file, at, str(column.column))
-    if mapping.pace is not None:
-        columns["time"] = mapping.pace.times(columns["displacement"], np.array([order for _, order, _ in rows]))
-        check_magnitudes(columns["time"], file, at, "time")
-    time = columns["time"]
-    back = np.flatnonzero(np.diff(time) < 0)
-    if len(back) and mapping.tests == "file":
-        before, here = at[int(back[0])], at[int(back[0]) + 1]
-        way = "header" if again else "blank line" if here > before + 1 else "column"
-        remedy = f'If another test begins here, write tests = "{way}" in {mapping.file.name} or part the file'
-        raise InputError(f"the time of test {name!r} goes back", file=file, row=here, remedy=remedy)
-    lines = [row - 1 for row in at]
-    return checked_curve(time, columns["force"], columns["displacement"], file, lines, name)

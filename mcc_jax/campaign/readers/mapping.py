@@ -50,7 +50,8 @@ the last column that has a name, and rows of delimiters only, hold nothing.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
@@ -65,8 +66,9 @@ from ..columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
 from ..metadata import load_toml_file, typed
 from ..schema import Control
 from ..signal import turning_points
-from ..table import APOSTROPHES, SPACES, same_text
+from ..table import APOSTROPHES, SPACES, filled, same_text
 from .diameters import Diameters, check_triple
+from .text import decode_lines
 
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
@@ -78,14 +80,8 @@ _REVERSAL_SHARE = 0.02
 passes. Noise of a displacement is some 1e-4 of its range, elastic recovery on unloading some 1e-1."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How time is found where no column holds it.
-
-    Attributes:
-        interval_s: time between one sample and the next [s]; None if the speed gives the time.
-        speed_um_per_s: speed of the displacement [um/s]; None if the interval gives the time.
-    """
+class Pace(NamedTuple):
+    """How time is found where no column holds it: from the interval between samples, or the speed of displacement."""
 
     interval_s: float | None = None
     speed_um_per_s: float | None = None
@@ -93,14 +89,10 @@ class Pace:
     def times(self, displacement_um: np.ndarray, order: np.ndarray) -> np.ndarray:
         """Times [s] of the samples, shape (n,), never decreasing; the first row of the test is at 0.
 
-        With a speed v the time is the length of the path gone so far over v. The path runs from one turning point to
-        the next; between two of them no time passes until the displacement exceeds what it had reached, so that noise
-        adds nothing. A displacement at rest (a hold at constant displacement) takes no time: nothing in a file without
-        times shows how long it was.
-
-        Args:
-            displacement_um: displacement [um], shape (n,).
-            order: number of each sample's row in its test, from 0; rows with missing readings count, shape (n,).
+        `order` holds the number of each sample's row in its test; rows with missing readings count. With a speed the
+        time is the length of the path so far over the speed. The path runs from one turning point to the next; between
+        them no time passes until the displacement exceeds what it had reached, so that noise adds nothing. A hold at
+        constant displacement takes no time: nothing in the file shows how long it was.
         """
         if self.interval_s is not None:
             return self.interval_s * order
@@ -122,12 +114,6 @@ Place = Text | Annotated[int, Meta(ge=1)]
 Rate = Annotated[float, Meta(ge=1e-15, le=1e15)]
 
 
-class TestColumn(Struct, forbid_unknown_fields=True):
-    """Which column names the test."""
-
-    column: Place
-
-
 class Column(Struct, forbid_unknown_fields=True):
     """Which column holds a quantity, and what its numbers mean."""
 
@@ -144,6 +130,12 @@ class Time(Struct, forbid_unknown_fields=True):
     sign: Literal[1, -1] = 1
     speed: Rate | None = None
     interval: Rate | None = None
+
+
+class TestColumn(Struct, forbid_unknown_fields=True):
+    """Which column names the test."""
+
+    column: Place
 
 
 class Columns(Struct, forbid_unknown_fields=True):
@@ -201,14 +193,14 @@ class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if not _is_encoding(self.encoding):
-            raise _wrong(f"{self.encoding!r} is no encoding", "encoding", f"Write {WRITE['encoding']}")
+            raise _wrong(f"{self.encoding!r} is no encoding", "encoding")
         if self.thousands not in (None, *_THOUSANDS):
-            raise _wrong(f"{self.thousands!r} is not allowed", "thousands", f"Write {WRITE['thousands']}")
+            raise _wrong(f"{self.thousands!r} is not allowed", "thousands")
         self.delimiter = DELIMITERS.get(self.delimiter, self.delimiter)
         self.thousands = None if self.thousands is None else _THOUSANDS[self.thousands]
-        if self.decimal_mark in (self.thousands or "") or (self.delimiter == " " and " " in (self.thousands or "")):
-            other = "delimiter" if self.decimal_mark not in (self.thousands or "") else "decimal mark"
-            raise _wrong(f"the mark between thousands is also the {other}", "thousands", "Correct one of them")
+        for name, mark in (("decimal mark", self.decimal_mark), ("delimiter", self.delimiter)):
+            if self.thousands and mark in self.thousands and (name == "decimal mark" or mark == " "):
+                raise _wrong(f"the mark between thousands is also the {name}", "thousands", "Correct one of them")
         if self.begin is not None and self.skip_rows is not None:
             raise _wrong("is given in addition to 'skip_rows'", "begin", "Keep one of them")
         if self.header_rows == 0 and (self.begin is not None or self.tests == "header"):
@@ -222,7 +214,7 @@ class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
         if self.diameters is not None and self.diameters_um is not None:
             raise _wrong("is given in addition to 'diameters_um'", "diameters", "Keep one of them")
         if self.diameters is not None and len(self.diameters.names) == 2:
-            raise _wrong("must name one row, or three", "diameters.header", f"Write {WRITE['header']}")
+            raise _wrong("must name one row, or three", "diameters.header")
         for name, triple in (self.diameters_um or {}).items():
             check_triple(triple, f"{name!r}", self.file)
         _ = self.pace, self.sources, self.diameter_factor
@@ -307,15 +299,69 @@ def _is_encoding(name: str) -> bool:
         return False
 
 
-def _wrong(problem: str, key: str, remedy: str) -> InputError:
-    return InputError(problem, column=key, remedy=remedy)
+def _wrong(problem: str, key: str, remedy: str = "") -> InputError:
+    return InputError(problem, column=key, remedy=remedy or f"Write {WRITE[key.rpartition('.')[2]]}")
 
 
 def _factor(unit: str, dimension: str, place: str) -> Fraction:
     try:
-        if unit:
-            return unit_factor(unit, dimension)
-        problem = "the unit is missing"
+        return unit_factor(unit, dimension)
     except ValueError as error:
-        problem = str(error)
-    raise _wrong(problem, f"{place}.unit", f"Write one of {EXAMPLES[dimension]}")
+        raise _wrong(str(error), f"{place}.unit", f"Write one of {EXAMPLES[dimension]}") from None
+
+
+# ---- a mapping file to begin with, for a table that no reader knows --------------------------------------------------
+
+_LINES = 500
+"""So many lines of a file are looked at."""
+_NUMBER = re.compile(r"[-+]?[0-9]+(?:[.,][0-9]*)?(?:[eE][-+]?[0-9]+)?")
+_COLUMNS = (
+    'time = {{ column = {}, unit = "s" }}, force = {{ column = {}, unit = "mN" }}, '
+    'displacement = {{ column = {}, unit = "um" }}'
+)
+_HOW = "Write a TOML mapping file and give it with --mapping; for example"
+EXAMPLE = f'{_HOW} decimal_mark = "."; [columns] ' + _COLUMNS.format('"Time"', '"Load"', '"Depth"')
+"""What to do about a file that shows nothing of itself."""
+
+
+def suggested_mapping(data: bytes) -> str:
+    """What to do about a file of an unknown format: a mapping file after what the file itself shows, in one line.
+
+    Which column is which, and its unit, is not guessed: the names of the columns are given in their order.
+    """
+    lines = decode_lines(data)[:_LINES]
+    tables = {name: [_cells(line, mark) for line in lines] for name, mark in DELIMITERS.items()}
+    samples = {name: [i for i, cells in enumerate(rows) if _all_numbers(cells)] for name, rows in tables.items()}
+    name = max(samples, key=lambda name: len(samples[name]))
+    if not samples[name]:
+        return EXAMPLE
+    rows, first = tables[name], samples[name][0]
+    keys = [f'delimiter = "{name}"']
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        keys.insert(0, 'encoding = "cp1252"')
+    if name != "comma":
+        comma = any("," in cell for i in samples[name] for cell in rows[i])
+        keys.append(f'decimal_mark = "{"," if comma else "."}"')
+    head = first  # of the rows of names, and of units below them, in front of the samples
+    while first - head < 2 and head > 0 and len(rows[head - 1]) == len(rows[first]) and all(rows[head - 1]):
+        head -= 1
+    if head == first:
+        return f"{_HOW} {'; '.join(keys)}; header_rows = 0; [columns] {_COLUMNS.format(1, 2, 3)}"
+    if head > 0:
+        keys.append(f'begin = "{rows[head][0]}"')
+    if first - head > 1:
+        keys.append("header_rows = 2")
+    listed = ", ".join(f'"{one}"' for one in rows[head])
+    return f"{_HOW} {'; '.join(keys)}; [columns] {_COLUMNS.format(*['"..."'] * 3)}; its columns are {listed}"
+
+
+def _cells(line: str, mark: str) -> list[str]:
+    """The cells of a line, without quotes and blanks around them; empty ones behind the last are none."""
+    cells = [cell.strip().strip('"').strip() for cell in line.split(None if mark == " " else mark)]
+    return cells[: filled(cells)]
+
+
+def _all_numbers(cells: Sequence[str]) -> bool:
+    return len(cells) > 1 and all(_NUMBER.fullmatch(cell) for cell in cells)

@@ -59,15 +59,13 @@ def _curve(lines: list[str], file: Path, name: str) -> Curve:
 
 
 def _entries(data: bytes, file: Path) -> list[tuple[str, bytes]]:
+    """Names and contents of an archive's files."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-            if sum(entry.file_size for entry in entries) > UNPACKED_BYTES:
-                problem = "the archive is too large for an instrument's export"
-                raise InputError(problem, file=file, remedy="Split it")  # noqa: TRY301
-            return [(entry.filename, archive.read(entry)) for entry in entries]
-    except InputError:
-        raise
+            if sum(entry.file_size for entry in entries) <= UNPACKED_BYTES:
+                return [(entry.filename, archive.read(entry)) for entry in entries]
     except Exception:  # zipfile and what unpacks have no common kind of error
-        problem = "the archive is damaged or encrypted"
-        raise InputError(problem, file=file, remedy="Unpack it, or export it again") from None
+        problem, remedy = "the archive is damaged or encrypted", "Unpack it, or export it again"
+        raise InputError(problem, file=file, remedy=remedy) from None
+    raise InputError("the archive is too large for an instrument's export", file=file, remedy="Split it")

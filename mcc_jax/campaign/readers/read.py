@@ -10,24 +10,24 @@ from typing import Any
 from ... import arguments
 from ..._errors import InputError
 from ..findings import Finding
-from ..schema import Campaign, Metadata
+from ..schema import CHANNELS, Campaign, Metadata
 from ..table import binary_kind, read_bytes
 from ..validate import check_campaign
 from ..workbook import is_workbook
-from . import fischer, hysitron_hld, hysitron_lc, micromaterials
+from . import fischer, hysitron, micromaterials
 from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
 from .mapped import read_mapped
-from .mapping import MappingFile, read_mapping
-from .suggestion import EXAMPLE, suggested_mapping
+from .mapping import EXAMPLE, MappingFile, read_mapping, suggested_mapping
 from .text import Tests, decode_lines
 
 FORMATS = {
-    "Fischer HM export": fischer,
-    "Hysitron hld": hysitron_hld,
-    "Hysitron load-control text": hysitron_lc,
-    "Micro Materials text (also many in one zip)": micromaterials,
+    "Fischer HM export": (fischer.matches, fischer.read),
+    "Hysitron hld": (hysitron.is_hld, hysitron.read_hld),
+    "Hysitron load-control text": (hysitron.is_text, hysitron.read_text),
+    "Micro Materials text (also many in one zip)": (micromaterials.matches, micromaterials.read),
 }
+"""Of each known format how it is recognised by its lines, and how they are read."""
 
 
 def read_instrument_file(
@@ -41,7 +41,7 @@ def read_instrument_file(
 
     Only units are converted (to mN, um, s) and, where a mapping says so, signs; nothing is shifted, smoothed,
     cut or corrected. What the file says besides the curves is kept in `Metadata.other`; what was left out on the
-    user's word (rows with missing readings, files) is there under "conversion".
+    user's word (rows with missing readings, files) is there under "conversion". Particles have the tests' names.
 
     Args:
         path: the file: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip, or
@@ -52,69 +52,56 @@ def read_instrument_file(
             with files of several kinds: each file is read by the one that fits it.
         skip: names of files in the folder that are left out; may hold "*", "?".
 
-    Returns:
-        The campaign; particles have the tests' names.
-
     Raises:
         InputError: if the file is unknown or damaged, or diameters are missing.
     """
     place = arguments.file_path(path, "path")
     given = () if mapping is None else (mapping,) if isinstance(mapping, str | os.PathLike) else tuple(mapping)
     described = [read_mapping(one) for one in given]
+    for one in described:
+        if len(described) > 1 and one.diameters_um is not None:
+            problem = "cannot differ between mapping files"
+            raise InputError(problem, file=one.file, column="diameters_um", remedy="Give --diameters")
+        if place.is_dir() and one.test_name is not None:
+            problem = "is for one file, not for a folder"
+            raise InputError(problem, file=one.file, column="test_name", remedy="Remove it")
+        diameters_um = one.sizes_um if diameters_um is None else diameters_um
 
     def read(file: Path, data: bytes) -> Tests:
         return _read_by_one(data, file, described) if described else _read_known(data, file)
 
     findings: list[Finding] = []
     if place.is_dir():
-        for one in described:
-            if one.test_name is not None:
-                problem = "is for one file, not for a folder"
-                raise InputError(problem, file=one.file, column="test_name", remedy="Remove it")
         tests, keys, findings = read_folder(place, read, skip)
         origin = f"folder {place.resolve().name}, {tests.format}"
     else:
         if skip:
-            raise InputError(
-                "is a file, so there is nothing to skip", file=place, remedy="Give --leave-out with a folder"
-            )
+            problem = "is a file, so there is nothing to skip"
+            raise InputError(problem, file=place, remedy="Give --leave-out with a folder")
         tests = read(place, read_bytes(place))
         alone = names_of(place) if len(tests.curves) == 1 else ()
         keys = {name: (name, *alone) for name in tests.curves}
         origin = f"{place.name}, {tests.format}"
-    for one in described:
-        if len(described) > 1 and one.diameters_um is not None:
-            problem = "cannot differ between mapping files"
-            raise InputError(problem, file=one.file, column="diameters_um", remedy="Give --diameters")
-        diameters_um = one.sizes_um if diameters_um is None else diameters_um
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
     if dropped := sum(tests.missing.values()):
         rows = "1 row with a missing reading was" if dropped == 1 else f"{dropped} rows with a missing reading were"
         where = "1 test" if len(tests.missing) == 1 else f"{len(tests.missing)} tests"
-        sentence = f"{rows} dropped, in {where}"
-        findings.append(Finding("missing readings", "info", sentence, "", tuple(tests.missing)))
+        findings.append(Finding("missing readings", "info", f"{rows} dropped, in {where}", "", tuple(tests.missing)))
+    provenance = "; ".join([f"{origin}, read by mcc_jax", *(finding.sentence for finding in findings)])
     if unused:
         rows = "1 row of the diameters is" if unused == 1 else f"{unused} rows of the diameters are"
         findings.append(Finding("diameters", "info", f"{rows} for no test here and not used"))
     other = dict(tests.other)
     if findings:
         other["conversion"] = {"findings": [finding.to_json() for finding in findings]}
-    provenance = "; ".join([f"{origin}, read by mcc_jax", *(f.sentence for f in findings if f.check != "diameters")])
-    campaign = Campaign(
-        particles=tuple(tests.curves),
-        diameters_um=sizes,
-        curves=tuple(tests.curves.values()),
-        metadata=Metadata(control=tests.control, provenance=provenance, other=other),
-        source=str(place),
-    )
-    check_campaign(campaign, file=place)
-    return campaign
+    metadata = Metadata(control=tests.control, provenance=provenance, other=other)
+    campaign = Campaign(tuple(tests.curves), sizes, tests.curves.values(), metadata=metadata, source=place)
+    return check_campaign(campaign, file=place)
 
 
 def _read_known(data: bytes, file: Path) -> Tests:
-    """Read a file of a known format, recognised by its content."""
     if is_workbook(data):
-        raise InputError("an Excel workbook has no format of its own", file=file, remedy=EXAMPLE)
+        raise InputError("an Excel workbook has no known format", file=file, remedy=EXAMPLE)
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return micromaterials.read_zip(data, file)
     kind = binary_kind(data)
@@ -122,9 +109,9 @@ def _read_known(data: bytes, file: Path) -> Tests:
         problem = f"the file is {kind}; no reader knows it"
         raise InputError(problem, file=file, remedy="Export it from the instrument as text")
     lines = decode_lines(data)
-    for reader in FORMATS.values():
-        if reader.matches(lines):
-            return reader.read(lines, file)
+    for matches, read in FORMATS.values():
+        if matches(lines):
+            return read(lines, file)
     problem = f"the format is not known (known: {', '.join(FORMATS)})"
     raise InputError(problem, file=file, remedy=suggested_mapping(data))
 
@@ -146,19 +133,14 @@ def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Te
         raise failed[0].changed(problem=failed[0].problem + more)
     (chosen, tests), *others = fitting
     for other, again in others:
-        if not _same(tests, again):
+        if _content(again) != _content(tests):
             problem = f"{chosen.file.name} and {other.file.name} both fit this file and read it differently"
-            raise InputError(problem, file=file, remedy="Give files of the two kinds in commands of their own")
+            raise InputError(problem, file=file, remedy="Give files of the two kinds in separate commands")
     return tests
 
 
-def _same(one: Tests, other: Tests) -> bool:
-    def content(tests: Tests) -> tuple[Any, ...]:
-        readings = [
-            (name, *(values.tobytes() for values in (curve.time_s, curve.force_mN, curve.displacement_um)))
-            for name, curve in tests.curves.items()
-        ]
-        sizes = {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
-        return readings, sizes, tests.control
-
-    return content(one) == content(other)
+def _content(tests: Tests) -> tuple[Any, ...]:
+    """What two readings of a file must have in common."""
+    readings = [(name, *(getattr(curve, c).tobytes() for c in CHANNELS)) for name, curve in tests.curves.items()]
+    sizes = {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
+    return readings, sizes, tests.control

@@ -1,8 +1,12 @@
-"""Hysitron `.hld`: a header of `Key: value unit` lines, then blocks of approach, drift and test data.
+"""The two exports of Hysitron indenters, one test in each file, named by the file. Nothing in them is corrected.
 
-The test block is the curve (`Time_s`, `Force_uN`, `Disp_nm`). Everything else is kept in `Metadata.other`: the
-header as text, machine compliance and drift rate with their units in the key, the programmed segments, and the
-approach and drift blocks and the test block's further columns as lists. Nothing is corrected for any of them.
+`.hld`: a header of `Key: value unit` lines, then blocks of approach, drift and test data. The test block is the curve
+(`Time_s`, `Force_uN`, `Disp_nm`). Everything else is kept in `Metadata.other`: the header as text, machine compliance
+and drift rate with their units in the key, the programmed segments, and the approach and drift blocks and the test
+block's further columns as lists.
+
+Load-control text: a date, `Number of Points = N`, column names, segments separated by empty lines. The approach is part
+of the curve, as in the file. The columns in volts and the lengths of the segments are kept in `Metadata.other`.
 """
 
 from __future__ import annotations
@@ -19,15 +23,17 @@ from .text import Tests, checked_curve, cut_off, leading_number, number_block
 
 _BLOCK = re.compile(r"(Sample Approach|Drift Measurement|Test) Data Points: *(\d{1,9})\s*")
 _FORCES = ("Force_µN", "Force_uN", "Force_μN")
+_COUNT = re.compile(r"Number of Points *= *(\d{1,9})\s*")
+_TIME, _DEPTH, _LOAD = "Time (s)", "Depth (nm)", "Load (µN)"
 
 
-def matches(lines: list[str]) -> bool:
+def is_hld(lines: list[str]) -> bool:
     """Whether this is a Hysitron `.hld`."""
     return lines[0].startswith("File Version: Hysitron") or any(line.startswith("Test Data Points:") for line in lines)
 
 
-def read(lines: list[str], file: Path) -> Tests:
-    """The one test of the file, named by the file. Raises `InputError` if a block is missing, cut off or damaged."""
+def read_hld(lines: list[str], file: Path) -> Tests:
+    """The test of a `.hld`. Raises `InputError` if a block is missing, cut off or damaged."""
     blocks: dict[str, dict[str, np.ndarray]] = {}
     at: Sequence[int] = ()
     header: list[tuple[str, str]] = []
@@ -55,19 +61,15 @@ def read(lines: list[str], file: Path) -> Tests:
     if "Test" not in blocks:
         raise cut_off("the block 'Test Data Points' is missing", file)
     test = blocks.pop("Test")
-    force_name = next((name for name in _FORCES if name in test), "Force_µN")
+    force_name = next((name for name in _FORCES if name in test), _FORCES[0])
     for name in ("Time_s", "Disp_nm", force_name):
         if name not in test:
-            raise cut_off(
-                f"the test block has no column {name!r}; it has {', '.join(test)}", file, at[0] if at else None
-            )
-    curve = checked_curve(
-        test.pop("Time_s"), test.pop(force_name) / 1e3, test.pop("Disp_nm") / 1e3, file, at, file.stem
-    )
+            problem = f"the test block has no column {name!r}; it has {', '.join(test)}"
+            raise cut_off(problem, file, at[0] if at else None)
+    time, force, depth = (test.pop(name) for name in ("Time_s", force_name, "Disp_nm"))
+    curve = checked_curve(time, force / 1e3, depth / 1e3, file, at, file.stem)
     names = {"Sample Approach": "approach_block", "Drift Measurement": "drift_block"}
-    other: dict[str, Any] = _facts(header)
-    for block, columns in blocks.items():
-        other[names[block]] = _lists(columns)
+    other = _facts(header) | {names[block]: _lists(columns) for block, columns in blocks.items()}
     other["test_block_further_columns"] = _lists(test)
     mode = dict(header).get("FB Mode", "").lower()
     control: Control | None = "load" if "load" in mode else "displacement" if "disp" in mode else None
@@ -79,6 +81,7 @@ def _lists(columns: dict[str, np.ndarray]) -> dict[str, list[float]]:
 
 
 def _facts(header: list[tuple[str, str]]) -> dict[str, Any]:
+    """What the header says: compliance, drift rate, segments, and all other lines as they are."""
     plain: dict[str, str] = {}
     segments: list[dict[str, str]] = []
     for key, value in header:
@@ -98,3 +101,28 @@ def _facts(header: list[tuple[str, str]]) -> dict[str, Any]:
     if drift is not None and plain["Drift Rate"].endswith("nm/s"):
         other["drift_rate_um_per_s"] = drift / 1e3
     return other | {"programmed_segments": segments, "instrument_header": plain}
+
+
+def is_text(lines: list[str]) -> bool:
+    """Whether this is load-control text."""
+    head = lines[:20]
+    return any(_COUNT.fullmatch(line) for line in head) and any(line.startswith(_DEPTH) for line in head)
+
+
+def read_text(lines: list[str], file: Path) -> Tests:
+    """The test of load-control text. Raises `InputError` if samples or columns are missing or damaged."""
+    head = next(i for i, line in enumerate(lines) if line.startswith(_DEPTH))
+    count_row, announced = next((i + 1, int(m[1])) for i, line in enumerate(lines) if (m := _COUNT.fullmatch(line)))
+    names = [name.replace("μ", "µ").replace("uN", "µN").strip() for name in lines[head].split("\t")]
+    for name in (_TIME, _DEPTH, _LOAD):
+        if name not in names:
+            raise cut_off(f"the column {name!r} is missing", file, head + 1)
+    at = [i for i in range(head + 1, len(lines)) if lines[i].strip()]
+    if len(at) != announced:
+        raise cut_off(f"{announced} points are announced, the file holds {len(at)}", file, count_row)
+    columns = number_block(lines, at, names, file)
+    time, depth, load = (columns.pop(name) for name in (_TIME, _DEPTH, _LOAD))
+    curve = checked_curve(time, load / 1e3, depth / 1e3, file, at, file.stem)
+    lengths = [len(part) for part in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(part)]
+    other = {"date": lines[0].strip(), "block_lengths": lengths, "further_columns": _lists(columns)}
+    return Tests({file.stem: curve}, "Hysitron load-control text", "load", other)
