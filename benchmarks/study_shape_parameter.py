@@ -13,8 +13,12 @@ jax.config.update("jax_enable_x64", True)
 
 from mcc_jax import Instrument, adjust, paper_campaign  # noqa: E402
 from mcc_jax.calibrate import fit_shape_parameter, strain_table  # noqa: E402
-from mcc_jax.calibrate.paper.loading import fit_population, master_curve  # noqa: E402
-from mcc_jax.calibrate.paper.modulus import campaign_branches, fit_effective_modulus  # noqa: E402
+from mcc_jax.calibrate.paper_steps import (  # noqa: E402
+    campaign_branches,
+    fit_effective_modulus,
+    fit_population,
+    master_curve,
+)
 
 RESULT = _report.RESULTS / "shape_parameter.md"
 TRUE_A, TRUE_MODULUS = 1.43, 16_000.0

@@ -10,10 +10,10 @@ from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
 from .mode import Fit as Fit
 from .model import Model as Model
-from .paper.calibrate import PaperCalibration as PaperCalibration
-from .paper.calibrate import calibrate_paper as calibrate_paper
-from .paper.loading import strain_table as strain_table
-from .paper.shape import fit_shape_parameter as fit_shape_parameter
+from .paper import PaperCalibration as PaperCalibration
+from .paper import calibrate_paper as calibrate_paper
+from .paper_steps import fit_shape_parameter as fit_shape_parameter
+from .paper_steps import strain_table as strain_table
 from .posterior import Posterior as Posterior
 from .posterior import sample as sample
 from .predict import compare_with_paper as compare_with_paper

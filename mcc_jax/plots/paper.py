@@ -15,8 +15,7 @@ from matplotlib.ticker import ScalarFormatter
 from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ..calibrate.data import UNLOADED_FROM
-from ..calibrate.paper.loading import MasterCurve
-from ..calibrate.paper.modulus import collapsed_branches
+from ..calibrate.paper_steps import MasterCurve, collapsed_branches
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style

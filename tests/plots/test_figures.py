@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from reading_figures import check_layout, check_words, panels, texts
 
 from mcc_jax import plots
-from mcc_jax.calibrate.paper.modulus import ElasticFit, collapsed_branches
+from mcc_jax.calibrate.paper_steps import ElasticFit, collapsed_branches
 from mcc_jax.campaign import Metadata
 from mcc_jax.plots import (
     paper_figures,
@@ -347,7 +347,7 @@ def test_residuals(calibration):
 
 def test_what_is_missing_is_said(paper):
     """No unloading, no offset step, no shape parameter, a single shape."""
-    elastic = ElasticFit(None, np.nan, np.empty(0), (), False, "no unloading branch was measured")
+    elastic = ElasticFit(None, np.nan, np.empty(0), (), "no unloading branch was measured")
     r = dataclasses.replace(
         paper,
         elastic=elastic,

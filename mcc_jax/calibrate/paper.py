@@ -9,34 +9,95 @@ from functools import cached_property
 from typing import Any, get_args
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ... import arguments
-from ..._errors import InputError
-from ..._types import Progress
-from ...campaign import (
+from .. import arguments
+from .._errors import InputError
+from .._format import described
+from .._types import Progress
+from ..campaign import (
     THRESHOLD_MPA,
     Adjustment,
     Campaign,
     Finding,
     adjust,
     check_tests,
+    effective_diameter_um,
     of_each_particle,
     particle_batch,
+    stress_and_strain,
 )
-from ...campaign.adjustment import refusal
-from ...geometry import plastic_shape_factor
-from ...law import MccLaw, StrainScaling, Unloading
-from ..data import MOST_POINTS, point_noise_um, rows_from_contact
-from ..estimates import NO_SAMPLER, estimate, finite, force_zero
-from ..judgement import judged, misfit_note, numbers_in_reach, unlike_others
-from ..results import Calibration
-from .loading import MasterCurve, PlasticFit, StrainTable, fit_population, master_curve, strain_table
-from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
-from .prediction import ParticleFit, predict_particles
-from .shape import Objective, ShapeFit, fit_shape_parameter
+from ..campaign.adjustment import refusal
+from ..geometry import plastic_shape_factor
+from ..law import MccLaw, Plastic, StrainScaling, Unloading
+from .curves import responses
+from .data import MOST_POINTS, padded_length, point_noise_um, records_of, rows_from_contact
+from .estimates import NO_SAMPLER, estimate, finite, force_zero
+from .judgement import judged, misfit_note, numbers_in_reach, unlike_others
+from .paper_steps import (
+    ElasticFit,
+    MasterCurve,
+    Objective,
+    PlasticFit,
+    ShapeFit,
+    StrainTable,
+    campaign_branches,
+    fit_effective_modulus,
+    fit_polynomial,
+    fit_population,
+    fit_shape_parameter,
+    master_curve,
+    strain_table,
+)
+from .results import Calibration
+from .sharding import filled_rows
 
 LARGEST_SHAPE_FACTOR = 4.0  # twice the paper's largest: shape factors beyond come from curves that do not collapse
+
+
+@dataclass(frozen=True)
+class ParticleFit:
+    """One particle against the calibrated law.
+
+    Attributes:
+        plastic: C1, C3, C5 of this particle's own adjusted loading curve, under the common `a`.
+        zero_um: what the offset step, and the contact point, take off its displacement [um].
+        measured_um: measured displacement less `zero_um` [um], at every point.
+        predicted_um: displacement under the measured force by the mean law, scaled by this particle's size and shape
+            [um].
+        own_um: the same with the particle's own C1, C3, C5.
+        used: which points enter `rms_um`: those after contact and above the threshold that may be compared.
+    """
+
+    plastic: tuple[float, float, float]
+    zero_um: float
+    measured_um: np.ndarray
+    predicted_um: np.ndarray
+    own_um: np.ndarray
+    used: np.ndarray
+
+    __repr__ = described()
+
+    @property
+    def rms_um(self) -> float:
+        """Root mean square of measured less predicted [um]; NaN where nothing is compared."""
+        return self._rms(self.predicted_um)
+
+    @property
+    def own_rms_um(self) -> float:
+        """The same with its own coefficients [um]."""
+        return self._rms(self.own_um)
+
+    @property
+    def range_um(self) -> float:
+        """Range of the measured displacement where it is compared [um]."""
+        return float(np.ptp(self.measured_um[self.used]))
+
+    def _rms(self, expected_um: np.ndarray) -> float:
+        away = (self.measured_um - expected_um)[self.used]
+        return float(np.sqrt(np.mean(away**2))) if len(away) else float("nan")
 
 
 @dataclass(frozen=True, repr=False)
@@ -121,19 +182,15 @@ class PaperCalibration(Calibration):
         dropped = int((~self.adjustment.kept).sum())
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
-        if self.shape_factor_max > LARGEST_SHAPE_FACTOR:
+        largest = float(self.table.shape_factor(self.a).max())
+        if largest > LARGEST_SHAPE_FACTOR:
             notes.append(
-                f"a = {self.a:.3g} makes shape factors of up to {self.shape_factor_max:.3g}: "
+                f"a = {self.a:.3g} makes shape factors of up to {largest:.3g}: "
                 "the shape factor does not bring these curves together"
             )
         if self.misfit_note is not None:
             notes.append(self.misfit_note)
         return notes
-
-    @property
-    def shape_factor_max(self) -> float:
-        """Largest shape factor of the particles used [-]; 1.87 in the paper."""
-        return float(self.table.shape_factor(self.a).max())
 
     @property
     def misfit_note(self) -> str | None:
@@ -151,8 +208,13 @@ class PaperCalibration(Calibration):
         return self._misfit("own_rms_um")
 
     def _misfit(self, name: str) -> float:
-        fits = [p for p in self.particles if p is not None and p.used.any()]
-        return float(np.median([getattr(p, name) / max(p.range_um, 1e-300) for p in fits]))
+        return float(np.median([getattr(p, name) / max(p.range_um, 1e-300) for p in self._compared.values()]))
+
+    @property
+    def _compared(self) -> dict[str, ParticleFit]:
+        """The particles of which points are compared with the law, by name."""
+        fits = zip(self.campaign.particles, self.particles, strict=True)
+        return {name: fit for name, fit in fits if fit is not None and fit.used.any()}
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
@@ -267,14 +329,13 @@ def calibrate_paper(
     progress("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:
+        problem = f"the calibration needs two usable particles or more, {adjustment.kept.sum()} can be used"
         if len(campaign) == 1:
             raise InputError(
-                "the calibration needs two usable particles or more, 1 can be used: this method compares particles",
+                f"{problem}: this method compares particles",
                 file=campaign.source or None,
                 remedy="Test a second particle, or calibrate by another method (least-squares, bayes).",
             )
-        usable = int(adjustment.kept.sum())
-        problem = f"the calibration needs two usable particles or more, {usable} can be used"
         raise refusal(campaign, problem, adjustment.reasons)
     with numbers_in_reach(campaign):
         table = strain_table(adjustment, campaign.diameters_um)
@@ -310,15 +371,20 @@ def calibrate_paper(
         seed,
         time.perf_counter() - started,
     )
-    fits = [(n, p) for n, p in zip(campaign.particles, particles, strict=True) if p is not None and p.used.any()]
-    misfit, ranges = (np.array(v) for v in ([p.own_rms_um for _, p in fits], [p.range_um for _, p in fits]))
-    outlying = unlike_others([name for name, _ in fits], misfit, ranges)
+    fits = calibration._compared
+    misfit, ranges = np.array([(one.own_rms_um, one.range_um) for one in fits.values()]).reshape(-1, 2).T
+    outlying = unlike_others(list(fits), misfit, ranges)
 
     def again(some: Campaign) -> dict[str, Any]:
-        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "objective": objective, "seed": seed}
-        form: dict[str, Any] = {"unloading": unloading, "strain_scaling": strain_scaling}
-        chosen = None if reference not in some.particles else reference
-        return calibrate_paper(some, reference=chosen, without_flagged=False, **settings, **form).answer()
+        return calibrate_paper(
+            some,
+            threshold_MPa=threshold_MPa,
+            objective=objective,
+            reference=reference if reference in some.particles else None,
+            unloading=unloading,
+            strain_scaling=strain_scaling,
+            without_flagged=False,
+        ).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
@@ -343,3 +409,50 @@ def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective,
     elif len(table.index) < 3 and objective == "full":
         return None
     return fit_shape_parameter(table, "reference", index)
+
+
+def predict_particles(
+    campaign: Campaign, adjustment: Adjustment, law: MccLaw, eta: np.ndarray
+) -> tuple[ParticleFit | None, ...]:
+    """Every kept particle's displacement under its measured force, by the mean law and by its own coefficients.
+
+    `eta` are the shape factors of all particles, shape (N,). One entry per particle, None where it was not kept.
+    """
+    kept = np.flatnonzero(adjustment.kept)
+    own = []
+    for i in kept:
+        curve = adjustment.curves[i]
+        assert curve is not None
+        # Residuals are relative: below a fiftieth of the peak they would be those of the force read-out.
+        use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
+        own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
+    # Campaigns of similar size and length share one compilation.
+    rows = filled_rows(len(kept))
+    points = [np.arange(len(campaign.curves[i])) for i in kept]
+    longest = padded_length(max(map(len, points)))
+    record = records_of(campaign, kept.tolist(), adjustment.segments, points, longest).record
+    records = jax.tree.map(lambda x: np.asarray(x)[rows], record)
+    sizes = particle_batch(campaign.diameters_um[kept[rows]])
+    plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(np.array(own)[rows].T))
+    same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
+    mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
+    by_mean, by_own = (np.asarray(responses(laws, sizes, records)) for laws in (mean, same))
+    fits: list[ParticleFit | None] = [None] * len(campaign)
+    for row, i in enumerate(kept):
+        curve = campaign.curves[i]
+        stress, strain = stress_and_strain(curve, campaign.diameters_um[i], adjustment.segments[i])
+        measured = (strain + adjustment.shift[i]) * effective_diameter_um(campaign.diameters_um[i])
+        touching = np.ones(len(curve), bool)
+        for segment in adjustment.segments[i]:
+            if segment.kind == "approach":
+                touching[segment.start : segment.stop] = False
+        used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max())) & curve.compared
+        fits[i] = ParticleFit(
+            (float(plastic.C1[row]), float(plastic.C3[row]), float(plastic.C5[row])),
+            float(curve.displacement_um[0] - measured[0]),
+            measured,
+            by_mean[row, : len(curve)],
+            by_own[row, : len(curve)],
+            used,
+        )
+    return tuple(fits)
