@@ -24,8 +24,7 @@ import numpy as np
 
 import mcc_jax as mcc
 from mcc_jax.calibrate.forward import Forms, Point, linearise
-from mcc_jax.calibrate.linearisation import score_of_effects
-from mcc_jax.calibrate.noise import Noise
+from mcc_jax.calibrate.noise import Noise, effects_grams
 from mcc_jax.effects import find_variant
 
 RESULTS = Path(__file__).parent / "results"
@@ -46,13 +45,14 @@ def campaign_of(seed: int, effects: tuple[mcc.HiddenEffect, ...] = ()) -> mcc.Ca
 def strength(base: mcc.calibrate.Fit, name: str, strong: str) -> float:
     """Amplitude whose residual, every particle's own numbers integrated out, is as large as the setting says."""
     formula, further = EFFECTS[name]
-    effect = (find_variant(formula).build(0.0, **further),)
+    variant = find_variant(formula)
+    forms = Forms(base.model.unloading, (variant,))
+    theta = np.array([0.0, *(further[n.name] for n in variant.nuisances)])
     true = Noise.of((INSTRUMENT.displacement_noise_um, INSTRUMENT.force_noise_mN, 1e-6, 0.2), jnp.ones(PARTICLES))
-    point = Point(base.point.latent, base.point.zero, jnp.zeros((PARTICLES, 0)))
-    linear = linearise(point, base.tests, Forms(base.model.unloading))
-    model = base.model
-    kinds = effect, model.forms, model.zero_prior[1], model.correlation, model.along
-    information = float(np.asarray(score_of_effects(point, base.tests, linear, true, *kinds))[:, 0, 1].sum())
+    point = Point(base.point.latent, base.point.zero, jnp.asarray(np.broadcast_to(theta, (PARTICLES, len(theta)))))
+    linear, model = linearise(point, base.tests, forms), base.model
+    kinds = model.zero_prior[1], model.correlation, model.along
+    information = float(np.asarray(effects_grams(base.tests, linear, true, *kinds))[:, 0, 0].sum())
     points = int(np.asarray(base.tests.mask).sum())
     squares = WEAK**2 if strong == "weak" else (float(strong) - 1) * points
     return float(np.sqrt(squares / information))

@@ -44,8 +44,7 @@ def fit(
     campaign = check_tests(campaign)
     progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     with numbers_in_reach(campaign):
-        selection, found, _ = prepare(campaign, model, threshold_MPa, progress=progress)
-    return found.first(len(selection.kept))
+        return prepare(campaign, model, threshold_MPa, progress=progress)[1]
 
 
 # ---- models of one campaign ------------------------------------------------------------------------------------------

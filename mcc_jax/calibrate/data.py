@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -64,7 +64,6 @@ class Tests(eqx.Module):
         branch: index of the point from which a point's branch starts; its own on virgin loading.
         reading: whether a point's force is a reading of its own.
         peak_error: standard error of the force from which its branch starts, in those of a reading [-].
-        weight: 1 for particles, 0 for padding; None where all are particles.
         force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
         peak_sd: standard deviation of the force of each point's branch peak where it was worked out otherwise, from
             readings that saturate [mN]; None where none was.
@@ -83,7 +82,6 @@ class Tests(eqx.Module):
     branch: Int[Array, "particles points"]
     reading: Bool[Array, "particles points"]
     peak_error: Float[Array, "particles points"]
-    weight: Float[Array, " particles"] | None = None
     force_zero_sd: Float[Array, " particles"] | None = None
     peak_sd: Float[Array, "particles points"] | None = None
     reading_weight: Float[Array, "particles points"] | None = None
@@ -111,17 +109,6 @@ class Tests(eqx.Module):
     def effective_diameter(self) -> Float[Array, " particles"]:
         """D1 D2/D3 of every particle [um]."""
         return eqx.filter_vmap(lambda particle: particle.effective_diameter)(self.particle)
-
-
-def longer(tree: Any, particles: int) -> Any:
-    """Arrays over as many particles; copies of the last one are added."""
-
-    def one(x: Any) -> Array:
-        x = np.asarray(x)
-        more = particles - len(x)
-        return jnp.asarray(np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge") if more else x)
-
-    return jax.tree.map(one, tree)
 
 
 def padded_length(points: int) -> int:
@@ -216,7 +203,6 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         jnp.asarray(branch),
         jnp.asarray(records.reading),
         jnp.asarray(records.error),
-        None,
         *_errors_of_force(curves, used, branch),
     )
     return Selection(

@@ -23,7 +23,6 @@ from .model import Model, coefficients
 from .noise import standard_promotion
 from .particles import PROBES, Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
-from .sharding import count_of
 
 # Of NUTS where importance sampling failed. Around its mode, in coordinates scaled by the curvature there, a density
 # that is near normal takes 15 leapfrog steps a draw; one that needs over 31 would take minutes, and shows in R-hat.
@@ -42,7 +41,7 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: boo
     Without `fallback`, and where the fit did not converge, NUTS never runs, which takes minutes there: the draws are
     then those of the proposal.
     """
-    count, exact = count_of(fit.tests), exact_likelihood(fit)
+    count, exact = len(fit.tests), exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count, length.total) == 1
     fallback = fallback and bool(np.all(np.asarray(fit.converged)[1:]))
@@ -205,9 +204,9 @@ def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1
     def shaped(x: Any) -> np.ndarray:
         return np.asarray(x).reshape(length.chains, length.draws, *x.shape[1:])[:, ::keep]
 
-    count = count_of(fit.tests)
+    count = len(fit.tests)
     population = jax.tree.map(shaped, run.population)
-    eta = 1 + np.asarray(population.a)[..., None] * np.asarray(fit.marginal.flatness)[:count]
+    eta = 1 + np.asarray(population.a)[..., None] * np.asarray(fit.marginal.flatness)
     log_eta = np.log(eta)
     latent, theta, zero, likelihood = (
         np.reshape(x, (length.chains, len(x) // length.chains, count, *x.shape[2:])) for x in map(np.asarray, particles)

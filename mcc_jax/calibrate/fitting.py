@@ -16,20 +16,27 @@ from .._memory import make_room
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
-from .data import MOST_POINTS, Selection, Tests, longer, point_noise_um, select
-from .forward import Point, linearise
-from .linearisation import Linearisation, start_of_effects
-from .marginal import Marginal, summarise
+from .data import MOST_POINTS, Selection, Tests, point_noise_um, select
+from .forward import Linear, Point, linearise
+from .linearisation import Linearisation
+from .marginal import Summaries, summarise
 from .mode import Fit, LogPosterior, careful_enough, expect, log_densities, most_probable, population_of
 from .model import Model
-from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
-from .particle_fit import STEPS, ParticleFits, fit_particles, linear_starts
+from .noise import (
+    Noise,
+    NoiseFit,
+    effects_grams,
+    estimate_noise,
+    particle_scales,
+    squared_innovations,
+    student_weights,
+)
+from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .population import Population
 from .priors import Priors, SpreadCoordinate, check_prior_of_a, population_sites
-from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
+from .sharding import Blocks, block_size, require_same
 
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
-FIRST_STEPS = 10  # that all particles of many blocks take before the unfinished ones go on by themselves
 ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is allowed around the prior's centre
 NARROWEST = 1e-3  # least such standard deviation under the population: any smaller is badly scaled
 NOISE_BLOCKS = 4  # the noise of campaigns of more blocks is estimated from the particles of so many
@@ -58,15 +65,10 @@ def prepare(
     progress: Progress = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
-    """Select points and particles, pad to whole blocks, and fit: what every calibration begins with.
+    """What was selected, its fit, and the size of a block of particles: what every calibration begins with.
 
     The model's priors become the campaign's own where they have to (`in_own_units`). Settings are those of `fit_tests`.
-
-    Returns:
-        What was selected, the fit of the tests with padding, and the size of a block.
-
-    Raises:
-        InputError: if no particle can be used, numbers overflow, or processes were given different tests.
+    Raises `InputError` if no particle can be used, numbers overflow, or processes were given different tests.
     """
     make_room()
     model, note = in_own_units(campaign, model)
@@ -75,13 +77,12 @@ def prepare(
     selection = selection if note is None else replace(selection, notes=(*selection.notes, note))
     require_same(selection.tests)
     size = block_size(len(selection.tests))
-    tests = filled_up(selection.tests, size)
     if start is not None and start.point.theta.shape != (len(selection.kept), len(model.forms.names)):
         raise InputError(
             "start is of other particles or effects", remedy="Give the fit of the same campaign and the same model."
         )
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    found = fit_tests(tests, model, read_out, block=size, start=start, progress=progress, **settings)
+    found = fit_tests(selection.tests, model, read_out, block=size, start=start, progress=progress, **settings)
     parts = (found.point.latent, found.point.zero, found.mode, found.covariance)
     if not all(np.isfinite(np.asarray(part)).all() for part in parts):
         raise beyond_numbers(campaign, selection)
@@ -125,28 +126,24 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
 class _Fitter:
     """A fit under way: particles, noise and summaries at the current point, as attributes.
 
-    `own` are this process's tests, `weighted` all and its own tests with the weights that inference takes.
+    `weighted` are the tests with the weights of readings that inference takes.
     """
 
     def __init__(self, tests: Tests, model: Model, blocks: Blocks, progress: Progress) -> None:
-        self.model, self.blocks, self.progress = model, blocks, progress
-        self.tests, self.count = tests, count_of(tests)
         if model.robust:
-            self.tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
-        self.own = blocks.cut(self.tests)
-        self.weighted = self.tests, self.own
-        self.linearisation = Linearisation(self.own, self.count, model, blocks)
-        self.varying = tuple(k for k, _ in model.scatter.varying)
+            tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
+        self.model, self.blocks, self.progress = model, blocks, progress
+        self.tests = self.weighted = tests
+        self.linearisation = Linearisation(tests, model.forms, model.scatter.positive, blocks)
+        self.varying = [k for k, _ in model.scatter.varying]
 
-    def begin_at(self, start: Start) -> dict[str, Any]:
+    def begin_at(self, start: Start) -> dict[str, float]:
         """Particles and noise of another fit, and its values of the model's sites."""
-        N = len(self.tests)
-        point, scale = longer((start.point, start.noise.scale), N)
-        self.point, self.noise = point, NoiseFit.unsure(replace(start.noise, scale=scale), converged=True)
-        own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, list(self.varying)]])
-        white = np.exp(np.asarray(start.noise.logs)[0]) * np.asarray(scale)
-        self.individual = self.alone(white, point.theta, own[None])
-        self.linear = self.linearisation.at(point)
+        point, self.noise = start.point, NoiseFit.unsure(start.noise, converged=True)
+        own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, self.varying]])
+        white = np.exp(np.asarray(start.noise.logs)[0]) * np.asarray(start.noise.scale)
+        self.individual = self.alone(white, point.theta, own[:, None])
+        self.point, self.linear = point, self.linearisation.at(point)
         one = jax.tree.map(lambda x: np.asarray(x)[None], start.population)
         values = population_sites(self.model, np.asarray(self.tests.flatness), one).values
         return {name: float(value[0]) for name, value in values.items()}
@@ -156,37 +153,26 @@ class _Fitter:
         model, N = self.model, len(self.tests)
         theta = np.broadcast_to(model.forms.without_effects, (N, len(model.forms.names)))
         self.individual = self.alone(np.full(N, read_out_um), theta)
-        self.point = self.individual.point
         noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
         self.noise = NoiseFit.unsure(noise, converged=True)
-        latent, flatness = (np.asarray(v)[: self.count] for v in (self.point.latent, self.tests.flatness))
-        start = _start(latent, flatness, model)
-        self.linear = self.linearisation.at(self.point)
+        theta = np.zeros(0)
         if model.effects:
-            sites, theta = start_of_effects(self.point, self.own, self.count, self.linear, noise, model, self.blocks)
-            start |= sites
-            self.point = replace(self.point, theta=jnp.asarray(np.broadcast_to(theta, self.point.theta.shape)))
-            self.linear = self.linearisation.at(self.point)
-        return start
-
-    @property
-    def residual(self) -> Array:
-        """Measured less predicted displacement at the point [um]."""
-        return self.blocks.whole(self.linear.map(lambda wave: wave.residual))
+            theta = start_of_effects(self.individual.point, self.tests, noise, model, self.blocks)
+        here = np.where(np.arange(len(theta)) < len(model.effects), 0.0, theta)  # first around amplitudes of 0
+        self.point = replace(self.individual.point, theta=jnp.asarray(np.broadcast_to(here, (N, len(here)))))
+        self.linear = self.linearisation.at(self.point)
+        return _start(np.asarray(self.individual.point.latent), np.asarray(self.tests.flatness), theta, model)
 
     # ---- noise -------------------------------------------------------------------------------------------------------
 
-    def summaries(self, point: Point, linear: Parts) -> tuple[Marginal, Parts, Array]:
-        """`marginal`, `filters` and `white` of any point."""
-        m, cut = self.model, self.blocks.cut
-        kinds = m.zero_prior, m.scatter, m.correlation, m.along
-        places = cut(point), cut(self.linearisation.straight)
-        found = self.blocks.each(summarise, *places, self.weighted[1], linear, cut(self.noise.noise), *kinds)
-        marginal, filters, white = (found.map(lambda wave, k=k: wave[k]) for k in range(3))
-        return self.blocks.whole(marginal), filters, self.blocks.whole(white)
+    def summaries(self, point: Point, linear: Linear) -> Summaries:
+        """The tests at any point, summarised under the noise."""
+        m, straight = self.model, self.linearisation.straight
+        of_particles = point, straight, self.weighted, linear, self.noise.noise
+        return self.blocks.all(summarise, of_particles, m.zero_prior, m.scatter, m.correlation, m.along)
 
     def summarise(self) -> None:
-        """Summarise the tests at the point, under the noise."""
+        """Summarise the tests at the point."""
         self.marginal, self.filters, self.white = self.summaries(self.point, self.linear)
 
     def take_noise(self, *, uncertainty: bool) -> None:
@@ -198,18 +184,17 @@ class _Fitter:
             self.weigh()
             self.estimate_noise(uncertainty)
             self.summarise()
-        old, count = np.asarray(self.noise.noise.scale), self.count
+        noise = self.noise.noise
         squares, points = np.asarray(self.marginal.gram)[:, -1, -1], np.asarray(self.marginal.count)
-        scale = particle_scales(old[:count], squares[:count], points[:count] - 4)
-        scale = np.pad(scale, (0, len(old) - count), mode="edge")
-        if np.any(scale != old):
-            self.noise = replace(self.noise, noise=replace(self.noise.noise, scale=jnp.asarray(scale)))
+        scale = particle_scales(np.asarray(noise.scale), squares, points - 4)
+        if np.any(scale != np.asarray(noise.scale)):
+            self.noise = replace(self.noise, noise=replace(noise, scale=jnp.asarray(scale)))
             self.summarise()
 
     def take_white_noise(self) -> None:
         """White noise of the residuals' median modulus, which outliers do not move; summaries under it."""
-        residual, mask = np.asarray(self.residual)[: self.count], np.asarray(self.tests.mask)[: self.count]
-        width = max(1.4826 * np.median(np.abs(residual[mask])), 1e-9)
+        residual = np.asarray(self.linear.residual)[np.asarray(self.tests.mask)]
+        width = max(1.4826 * np.median(np.abs(residual)), 1e-9)
         noise = Noise.of([width, 0.0, 0.0, 1.0], jnp.asarray(np.ones(len(self.tests))))
         self.noise = replace(self.noise, noise=noise)
         self.summarise()
@@ -217,82 +202,69 @@ class _Fitter:
     def estimate_noise(self, uncertainty: bool) -> None:
         """The four numbers of the noise, of very many particles from some of them."""
         self.progress("estimating the noise")
-        m, blocks, own, linear, start = self.model, self.blocks, self.own, self.linear, self.noise.noise
+        m, blocks, old = self.model, self.blocks, self.noise.noise
+        given = self.tests, replace(self.linear, bends=None), old.scale
         if blocks.number > NOISE_BLOCKS:
-            rows = np.linspace(0, self.count - 1, NOISE_BLOCKS * blocks.size).astype(int)
-            blocks = Blocks(len(rows), blocks.size)
-            own = blocks.cut(_rows(self.tests, rows))
-            linear = blocks.each(linearise, blocks.cut(_rows(self.point, rows)), own, m.forms)
-            start = replace(start, scale=start.scale[rows])
-        prior = m.chosen_priors.noise
+            rows = np.linspace(0, len(self.tests) - 1, NOISE_BLOCKS * blocks.size).astype(int)
+            blocks, given = (
+                Blocks(len(rows), blocks.size),
+                jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), given),
+            )
+        tests, linear, scale = given
         found = estimate_noise(
-            own, linear, m.zero_prior[1], prior, start, m.correlation, m.along, uncertainty=uncertainty, blocks=blocks
+            tests,
+            linear,
+            m.zero_prior[1],
+            m.chosen_priors.noise,
+            replace(old, scale=scale),
+            m.correlation,
+            m.along,
+            uncertainty=uncertainty,
+            blocks=blocks,
         )
-        self.noise = replace(found, noise=replace(found.noise, scale=self.noise.noise.scale))
+        self.noise = replace(found, noise=replace(found.noise, scale=old.scale))
 
     def weigh(self) -> None:
         """New weights of the readings under Student noise."""
-        blocks, noise = self.blocks, self.blocks.cut(self.noise.noise)
-        squares = np.asarray(blocks.all(squared_innovations, self.weighted[1], self.filters, self.linear, noise))
+        of_particles = self.weighted, self.filters, self.linear, self.noise.noise
+        squares = np.asarray(self.blocks.all(squared_innovations, of_particles))
         weight, overstated = student_weights(squares, np.asarray(self.tests.mask))
         self.tests = replace(self.tests, reading_weight=jnp.asarray(weight))
-        weighted = replace(self.tests, reading_weight=jnp.asarray(weight / overstated))
-        self.own, self.weighted = blocks.cut(self.tests), (weighted, blocks.cut(weighted))
+        self.weighted = replace(self.tests, reading_weight=jnp.asarray(weight / overstated))
 
     # ---- particles ---------------------------------------------------------------------------------------------------
 
-    def particles(
-        self, white: Array | np.ndarray, centre: np.ndarray, width: np.ndarray, theta: Any, starts: Parts
-    ) -> ParticleFits:
-        """Every particle by itself, all blocks; what is unfinished in many of them goes on in blocks of its own.
-
-        A block takes as long as its slowest particle, and nearly every block has one that is slow.
-        """
+    def particles(self, white: Any, centre: Any, width: Any, theta: Any, starts: np.ndarray) -> ParticleFits:
+        """Every particle by itself, as `fit_particles`."""
         self.progress("fitting every particle")
-        arrays = tuple(jnp.asarray(np.asarray(v)) for v in (white, centre, width, theta))
-
-        def fit(blocks: Blocks, own: Parts, arrays: Any, starts: Parts, most_steps: int) -> ParticleFits:
-            cut = [blocks.cut(v) for v in arrays]
-            return blocks.all(fit_particles, own, *cut, starts, self.model.forms, self.varying, most_steps)
-
-        if self.blocks.whole_here:
-            return fit(self.blocks, self.own, arrays, starts, STEPS)
-        found = fit(self.blocks, self.own, arrays, starts, FIRST_STEPS)
-        unfinished = np.flatnonzero(~np.asarray(found.settled))
-        if not len(unfinished):
-            return found
-        rows = np.pad(unfinished, (0, -len(unfinished) % self.blocks.size), mode="edge")
-        few = Blocks(len(rows), self.blocks.size)
-        ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
-        again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, STEPS)
-        return jax.tree.map(lambda x, y: x.at[unfinished].set(y[: len(unfinished)]), found, again)
+        of_particles = self.tests, white, centre, width, theta, starts
+        shared = self.model.forms, tuple(self.varying), self.blocks.size
+        return self.blocks.share(fit_particles, of_particles, *shared)
 
     def alone(self, white: np.ndarray, theta: Any, starts: np.ndarray | None = None) -> ParticleFits:
         """Every particle on its own, the effects' numbers held."""
-        priors, N, varying = self.model.chosen_priors, len(self.tests), len(self.varying)
-        middle = np.append(_centre(priors), 0.0)
-        centre = np.broadcast_to(middle, (N, 5)).copy()
-        centre[:, 4] = self.zero_mean
-        width = np.broadcast_to(np.array([ALONE] * 4 + [priors.zero_um.sd]), (N, 5))
-        width = np.pad(width, ((0, 0), (0, varying)), constant_values=1e-12)
-        centre = np.concatenate([centre, np.asarray(theta)[:, list(self.varying)]], 1)
+        priors, N, more = self.model.chosen_priors, len(self.tests), len(self.varying)
+        middle = _centre(priors)
+        centre = np.column_stack([np.broadcast_to(middle, (N, 4)), self.zero_mean, np.asarray(theta)[:, self.varying]])
+        width = np.broadcast_to([ALONE] * 4 + [priors.zero_um.sd] + [1e-12] * more, centre.shape)
         if starts is None:
-            starts = np.pad(linear_starts(self.tests, middle[3]), ((0, 0), (0, 0), (0, varying)))
-        return self.particles(white, centre, width, theta, self.blocks.cut(jnp.asarray(starts), axis=1))
+            starts = np.pad(linear_starts(self.tests, middle[3]), ((0, 0), (0, 0), (0, more)))
+        return self.particles(white, centre, width, theta, starts)
 
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
-        before, expected, varying = self.point, expect(free, target), list(self.varying)
-        width = np.maximum(np.asarray(expected.sd), NARROWEST)
-        zero_sd = np.full(len(self.tests), self.model.chosen_priors.zero_um.sd)
-        spread = np.maximum(np.asarray(expected.theta_sd), 1e-12)
-        centre = np.column_stack([expected.mean, self.zero_mean, np.asarray(expected.theta_mean)])
-        widths = np.column_stack([width, zero_sd, spread])
-        own = np.asarray(expected.theta)[:, varying]
-        places = (before.latent, before.zero), (expected.latent, expected.zero), (expected.mean, before.zero)
-        several = np.stack([np.column_stack([latent, zero, own]) for latent, zero in places])
-        starts = self.blocks.cut(jnp.asarray(several), axis=1)
-        return self.particles(self.white, centre, widths, expected.theta, starts).point
+        before, N = self.point, len(self.tests)
+        expected = expect(free, target)
+        mean, latent, zero, theta = (
+            np.asarray(x)[:N] for x in (expected.mean, expected.latent, expected.zero, expected.theta)
+        )
+        sd, theta_mean, theta_sd = (np.asarray(x)[:N] for x in (expected.sd, expected.theta_mean, expected.theta_sd))
+        centre = np.column_stack([mean, self.zero_mean, theta_mean])
+        zero_sd = np.full(N, self.model.chosen_priors.zero_um.sd)
+        width = np.column_stack([np.maximum(sd, NARROWEST), zero_sd, np.maximum(theta_sd, 1e-12)])
+        places = (before.latent, before.zero), (latent, zero), (mean, before.zero)
+        starts = np.stack([np.column_stack([*place, theta[:, self.varying]]) for place in places], 1)
+        return self.particles(self.white, centre, width, theta, starts).point
 
     @property
     def zero_mean(self) -> np.ndarray:
@@ -307,9 +279,9 @@ class _Fitter:
             free = before + share * (after - before)
             point = self.together(target, free)
             linear = self.linearisation.at(point)
-            marginal = replace(self.summaries(point, linear)[0], scatter=target.marginal.scatter)
+            marginal = replace(self.summaries(point, linear).marginal, scatter=target.marginal.scatter)
             share /= 2
-            if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**HALVINGS:
+            if _density(free, LogPosterior.of(self.model, marginal)) > least or share < 0.5**HALVINGS:
                 self.point, self.linear = point, linear
                 return free
 
@@ -337,12 +309,12 @@ def fit_tests(
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
         rounds: how often noise, population and particles take turns, at least.
-        block: particles of a block, of which there is a whole number; 0 for all in one.
+        block: particles of a block; of `block_size` if 0.
         start: where to begin; the last turn is then the only one, unless the tests want more.
     """
     check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
-    N, effects, count = len(tests), bool(model.effects), count_of(tests)
-    fitter = _Fitter(tests, model, Blocks(N, block), progress)
+    effects, count = bool(model.effects), len(tests)
+    fitter = _Fitter(tests, model, Blocks(count, block), progress)
     first = fitter.begin(max(read_out_um, 1e-4)) if start is None else fitter.begin_at(start)
     begun = 0 if start is None else rounds
     free, turn = None, begun
@@ -355,7 +327,7 @@ def fit_tests(
         else:  # with effects no round knows that it is the last
             fitter.take_noise(uncertainty=effects or turn >= rounds - 1)
         progress("fitting the population")
-        target = LogPosterior(model, fitter.marginal)
+        target = LogPosterior.of(model, fitter.marginal)
         before = target.unconstrain(first) if free is None else free
         target = careful_enough(before, target, count)
         free, covariance, mode_converged = most_probable(before, target)
@@ -375,18 +347,18 @@ def fit_tests(
         # Again, with how the law bends over what is still open of the effects' numbers.
         fitter.linear = fitter.linearisation.at(fitter.point, _widths(free, covariance, target))
         fitter.summarise()
-        target = careful_enough(free, LogPosterior(model, fitter.marginal), count)
+        target = careful_enough(free, LogPosterior.of(model, fitter.marginal), count)
         free, covariance, mode_converged = most_probable(free, target)
-    alone = bool(np.all(np.asarray(fitter.individual.converged)[:count]))
+    alone = bool(np.all(np.asarray(fitter.individual.converged)))
     return Fit(
         model,
-        fitter.weighted[0],
+        fitter.weighted,
         fitter.individual,
         fitter.noise,
-        fitter.blocks.whole(fitter.filters),
+        fitter.filters,
         fitter.point,
-        fitter.residual,
-        target.marginal,
+        fitter.linear.residual,
+        replace(fitter.marginal, scatter=target.marginal.scatter),
         free,
         covariance,
         np.asarray([alone, fitter.noise.converged, mode_converged and finished]),
@@ -415,10 +387,6 @@ def _density(free: Array, target: LogPosterior) -> float:
     return float(log_densities(np.asarray(free)[None], target)[0])
 
 
-def _rows(tree: Any, rows: np.ndarray) -> Any:
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), tree)
-
-
 def _centre(priors: Priors) -> np.ndarray:
     """Centre of b1, b3, b5, e for what a curve alone does not say: the prior's, at the paper's typical shape factor."""
     log_eta = np.log(1.4)
@@ -426,29 +394,58 @@ def _centre(priors: Priors) -> np.ndarray:
     return np.append(C + log_eta, np.log(priors.effective_modulus_MPa.median))
 
 
-def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, float]:
+def _start(latent: np.ndarray, flatness: np.ndarray, theta: np.ndarray, model: Model) -> dict[str, float]:
     """Where to look for the population: the prior's a and the particles' own median and scatter under it."""
     priors = model.chosen_priors
     most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
     a = float(np.clip(priors.a.mean, -0.9 / most, -0.9 / least))
     log_eta = np.log(1 + a * flatness)
     b = latent[:, :3] - log_eta[:, None]
-    middle = np.median(b, axis=0) + log_eta.mean()
-    start = {
-        "a": a,
-        "log_modulus": float(np.median(latent[:, 3] - model.shape_power * log_eta)),
-        "log_noise_factor": 0.0,
-    }
-    for j, name in enumerate(("C1", "C3", "C5")):
-        prior = getattr(priors, f"tau_{name}")
-        tau = float(np.clip(np.std(b[:, j]), 0.05 * prior.sd, 2 * prior.sd))
-        start |= {
-            f"b{2 * j + 1}": float(middle[j]),
-            f"tau_{name}_coordinate": float(SpreadCoordinate(prior).coordinate(tau)),
-        }
+    middle, scatter = np.median(b, axis=0) + log_eta.mean(), np.std(b, axis=0)
+    start = dict(zip(model.forms.names, theta.tolist(), strict=True))
+    start |= {"a": a, "log_noise_factor": 0.0, "b1": middle[0], "b3": middle[1], "b5": middle[2]}
+    start["log_modulus"] = np.median(latent[:, 3] - model.shape_power * log_eta)
+    for j, name in enumerate(("tau_C1", "tau_C3", "tau_C5")):
+        prior = getattr(priors, name)
+        tau = float(np.clip(scatter[j], 0.05 * prior.sd, 2 * prior.sd))
+        start[f"{name}_coordinate"] = SpreadCoordinate(prior).coordinate(tau)
     for name in ("modulus_scatter", "shape_scatter"):
-        start[f"{name}_coordinate"] = float(SpreadCoordinate(getattr(priors, name)).coordinate(0.1))
+        start[f"{name}_coordinate"] = SpreadCoordinate(getattr(priors, name)).coordinate(0.1)
+    for v in model.effects:
+        start[f"{v.mechanism}_size"] = (v.sign or 1) * start[v.mechanism] / v.plausible[0]
+        start[f"tau_{v.mechanism}_coordinate"] = 1.0
     return start
+
+
+def start_of_effects(point: Point, tests: Tests, noise: Noise, model: Model, blocks: Blocks) -> np.ndarray:
+    """Numbers of the effects to start from.
+
+    Of every formula the values of its grid are taken whose amplitude, to first order, explains most of the residuals
+    that particles' own numbers leave. The noise has to be a small one: what effects explain must not have gone into it.
+    """
+    forms, grids = model.forms, [v.grid() for v in model.effects]
+    theta, best = np.zeros(len(forms.names)), np.full(len(grids), -1.0)
+    for k in range(max(map(len, grids))):
+        further = [grid[k % len(grid)] for grid in grids]
+        here = np.zeros(len(theta))  # amplitudes of 0: no effect changes what another one does
+        for v, values, places in zip(model.effects, further, forms.places, strict=True):
+            here[list(places[1:])] = [values[n.name] for n in v.nuisances]
+        there = replace(point, theta=jnp.asarray(np.broadcast_to(here, (len(tests), len(here)))))
+        linear = blocks.all(linearise, (there, tests), forms)
+        shared = model.zero_prior[1], model.correlation, model.along
+        gram = np.asarray(blocks.all(effects_grams, (tests, linear, noise), *shared)).sum(0)
+        for i, (v, places) in enumerate(zip(model.effects, forms.places, strict=True)):
+            score, amplitude = gram[i, -1], gram[i, -1] / max(gram[i, i], 1e-300)
+            gain = score * amplitude if v.sign * amplitude >= 0 else 0.0
+            if gain > best[i]:
+                best[i] = gain
+                size = np.clip(v.sign * amplitude, 0.3 * v.plausible[0], v.plausible[1])
+                theta[i] = v.sign * size if v.sign else amplitude
+                for n, place in zip(v.nuisances, places[1:], strict=True):
+                    low, high = n.plausible
+                    edge = 0.01 * (high - low)
+                    theta[place] = here[place] if low > 0 else np.clip(here[place], low + edge, high - edge)
+    return theta
 
 
 def checked_settings(

@@ -211,16 +211,17 @@ def unpack(y: Parameters, settings: Pooled, tests: Tests) -> Point:
     return Point(latent, y.local[:, 3], theta)
 
 
-def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tuple[Array, ...]]:
+def pooled_residual(
+    settings: Pooled, tests: Tests, weight: Float[Array, " particles"]
+) -> Callable[[Parameters], tuple[Array, ...]]:
     """Residuals as a function of the parameters: whitened ones of displacement, deviations of the particles from the
     population, of the zeros from the recorded contacts, and of the effects' further parameters from their priors, in
-    standard deviations."""
+    standard deviations. Weights are 1 of particles, 0 of padding."""
     scatter, at = settings.scatter, settings.population
     size = 3 + scatter.modulus
     tau = jnp.maximum(at.tau, LEAST_SPREAD)
     modulus = jnp.maximum(at.modulus_scatter, LEAST_SPREAD)
     mean_zero, sd_zero = settings.zero_prior
-    count = jnp.asarray(float(len(tests))) if tests.weight is None else jnp.sum(tests.weight)
 
     def residual(y: Parameters):
         point = unpack(y, settings, tests)
@@ -239,15 +240,14 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
         if len(settings.further):
             # A prior that all share, in equal parts of all particles.
             logs = y.shared[len(SHARED) + len(settings.forms.effects) :]
-            part = (logs - settings.further[:, 0]) / (settings.further[:, 1] * jnp.sqrt(count))
+            part = (logs - settings.further[:, 0]) / (settings.further[:, 1] * jnp.sqrt(jnp.sum(weight)))
             found.append(jnp.broadcast_to(part, (len(tests), len(part))))
-        weight = 1.0 if tests.weight is None else tests.weight[:, None]
-        return tuple(one * weight for one in found)
+        return tuple(one * weight[:, None] for one in found)
 
     return residual
 
 
 @compiled
-def fit_pooled(tests: Tests, settings: Pooled, start: Parameters) -> Solution:
+def fit_pooled(tests: Tests, settings: Pooled, start: Parameters, weight: Float[Array, " particles"]) -> Solution:
     """Minimise the pooled residuals."""
-    return minimise(pooled_residual(settings, tests), start, max_steps=300, tolerance=1e-7)
+    return minimise(pooled_residual(settings, tests, weight), start, max_steps=300, tolerance=1e-7)

@@ -28,6 +28,7 @@ from .model import Model
 from .population import COEFFICIENTS
 from .priors import SpreadCoordinate, nuisance_moments
 from .results import JointCalibration
+from .sharding import padded
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
 
@@ -339,9 +340,7 @@ def least_squares(
         losses[~np.isfinite(losses)] = np.inf
         if np.isinf(losses).all():
             raise beyond_numbers(campaign, selection)
-    count = len(selection.kept)
-    fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
-    settings = replace(settings, whitening=fit.filters)
+    best = found[int(np.argmin(losses))]
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
     calibration = LeastSquares(
         campaign,
@@ -373,4 +372,7 @@ def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, lo
     positive = settings.forms.positive
     further = np.where(positive, np.log(np.where(positive, theta[size:], 1.0)), theta[size:])
     shared = jnp.asarray(np.concatenate([[a, log_modulus], mu, theta[:size], further]))
-    return fit_pooled(tests, settings, Parameters(jnp.concatenate(local, 1), shared))
+    # Padded: campaigns of similar size share a compilation.
+    (longer, filters, own), weight = padded((tests, settings.whitening, jnp.concatenate(local, 1)))
+    found = fit_pooled(longer, replace(settings, whitening=filters), Parameters(own, shared), jnp.asarray(weight))
+    return found.first(len(tests))

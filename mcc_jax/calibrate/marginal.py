@@ -32,10 +32,10 @@ from .._types import Scalar
 from .compiling import compiled
 from .data import Tests
 from .forward import Linear, Point, snap
+from .linearisation import Straight, coordinates
 from .noise import Along, Correlation, Noise, Whitening, whitening
 from .population import Population, Scatter, moments, particles_at
 from .small_matrices import Cholesky, eliminate
-from .straightening import Straight, coordinates
 
 FARTHEST = 4.0  # exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test
 MIN_SHARE = 0.05  # a coefficient of the polynomial is not drawn below this share of its most probable value
@@ -44,7 +44,7 @@ MIN_SHARE = 0.05  # a coefficient of the polynomial is not drawn below this shar
 class Marginal(eqx.Module):
     r"""The tests around a point, zeros integrated out.
 
-    With u a particle's coordinates (kappa, the effects' parameters as in `straightening`, and products of these, to the
+    With u a particle's coordinates (kappa, the effects' parameters as in `linearisation`, and products of these, to the
     second order in effects), the log likelihood of a test is
 
     .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
@@ -299,7 +299,7 @@ def summarise(
         zero_slope=slopes,
         zero_sd=1 / jnp.sqrt(total),
         flatness=tests.flatness,
-        weight=tests.weight,
+        weight=None,
         scatter=scatter,
     )
     information = jax.vmap(lambda f: f.information)(filters)

@@ -27,6 +27,7 @@ from .model import Model
 from .noise import NoiseFit, Whitening, standard_promotion
 from .particle_fit import ParticleFits
 from .population import Population
+from .sharding import padded
 
 handlers: Any = numpyro.handlers
 
@@ -73,6 +74,12 @@ class LogPosterior(eqx.Module):
 
     model: Model = eqx.field(static=True)
     marginal: Marginal
+
+    @classmethod
+    def of(cls, model: Model, marginal: Marginal) -> LogPosterior:
+        """That of a fit's tests, padded: campaigns of similar size share their programs."""
+        longer, weight = padded(marginal)
+        return cls(model, replace(longer, weight=jnp.asarray(weight)))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -336,12 +343,12 @@ class Fit(eqx.Module):
     @property
     def target(self) -> LogPosterior:
         """The density of the population given all tests, in unbounded coordinates."""
-        return LogPosterior(self.model, self.marginal)
+        return LogPosterior.of(self.model, self.marginal)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates."""
-        return self.target.names
+        return coordinate_names(self.model)
 
     @property
     def population(self) -> Population:
@@ -367,22 +374,3 @@ class Fit(eqx.Module):
         start = init_to_value(values={"coordinates": jnp.zeros(coordinates.size)})
         model = partial(FitCoordinates.numpyro_model, coordinates)
         return NUTS(model, **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
-
-    def first(self, count: int) -> Fit:
-        """The same of the first `count` particles: without padding."""
-
-        def some(tree: Any) -> Any:
-            return jax.tree.map(lambda x: x[:count], tree)
-
-        marginal = replace(some(replace(self.marginal, weight=None)), scatter=self.marginal.scatter)
-        noise = replace(self.noise.noise, scale=self.noise.noise.scale[:count])
-        return replace(
-            self,
-            tests=some(replace(self.tests, weight=None)),
-            individual=some(self.individual),
-            noise=replace(self.noise, noise=noise),
-            filters=some(self.filters),
-            point=some(self.point),
-            residual=self.residual[:count],
-            marginal=marginal,
-        )

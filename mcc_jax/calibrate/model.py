@@ -139,7 +139,8 @@ class Model:
             noise_factor: whether a common factor on the noise is sampled.
         """
         p = self.chosen_priors
-        weight = jnp.ones_like(shapes.flatness) if shapes.weight is None else shapes.weight
+        weight = getattr(shapes, "weight", None)
+        weight = jnp.ones_like(shapes.flatness) if weight is None else weight
         low, high = bounds_of_a(shapes.flatness)
         reach = max(8 * p.a.sd, 8.0)  # the bounds scale a coordinate; they are no belief
         low, high = jnp.maximum(low, p.a.mean - reach), jnp.minimum(high, p.a.mean + reach)

@@ -32,7 +32,7 @@ from .compiling import compiled
 from .data import READING_UM, Tests
 from .forward import Linear
 from .priors import NoisePrior
-from .sharding import Blocks, Parts
+from .sharding import Blocks
 from .small_matrices import eliminate
 
 
@@ -274,39 +274,52 @@ def student_weights(squares: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, 
     return weight, float(max(sandwich * np.mean(w) / np.mean(w * z2), 1.0))
 
 
-def restricted_likelihood(
-    noise: Noise, tests: Tests, linear: Linear, zero_sd: Scalar, correlation: Correlation, along: Along
-) -> Float[Array, " particles"]:
-    """Log likelihood of each test under the noise, the particle's b1, b3, b5, e and zero integrated out.
-
-    They have standard deviations of 1 and `zero_sd`: wide, and enough to keep directions without data in place.
-    """
-
-    def one(scale: Scalar, tests: Tests, linear: Linear) -> Scalar:
-        filtered = whitening(noise, scale, tests, linear, correlation, along)
-        columns = [linear.columns[:, :4], jnp.where(tests.mask, zero_sd, 0.0)[:, None], linear.residual[:, None]]
-        white = filtered(jnp.concatenate(columns, 1))
-        left, log_integral = eliminate(white.T @ white, tuple(range(5)), jnp.ones(5))
-        return log_integral - 0.5 * (left[0, 0] + filtered.log_det)
-
-    return jax.vmap(one)(noise.scale, tests, linear)
-
-
-@compiled
-def likelihoods(
-    logs: Float[Array, "many 4"],
-    scale: Float[Array, " particles"],
+def without_own(
+    noise: Noise,
+    scale: Scalar,
     tests: Tests,
     linear: Linear,
     zero_sd: Scalar,
     correlation: Correlation,
     along: Along,
-) -> Float[Array, "many particles"]:
-    """Log likelihood of each test under each of many noises; 0 of padding."""
-    each = jax.vmap(
-        lambda one: restricted_likelihood(Noise.from_logs(one, scale), tests, linear, zero_sd, correlation, along)
-    )(logs)
-    return each if tests.weight is None else tests.weight[None] * each
+) -> tuple[Float[Array, "q q"], Scalar]:
+    """Gram matrix of one test's effects and residual, the particle's b1, b3, b5, e and zero integrated out, and the log
+    of the factor that goes with it.
+
+    They have standard deviations of 1 and `zero_sd`: wide, and enough to keep directions without data in place.
+    """
+    filtered = whitening(noise, scale, tests, linear, correlation, along)
+    own = linear.columns[:, :4], jnp.where(tests.mask, zero_sd, 0.0)[:, None]
+    white = filtered(jnp.concatenate([*own, linear.columns[:, 4:], linear.residual[:, None]], 1))
+    left, log_integral = eliminate(white.T @ white, tuple(range(5)), jnp.ones(5))
+    return left, log_integral - 0.5 * filtered.log_det
+
+
+@compiled
+def likelihoods(
+    scale: Float[Array, " particles"],
+    tests: Tests,
+    linear: Linear,
+    logs: Float[Array, "many 4"],
+    zero_sd: Scalar,
+    correlation: Correlation,
+    along: Along,
+) -> Float[Array, "particles many"]:
+    """Log likelihood of each test without effects under each of many noises, the particle's numbers integrated out."""
+
+    def one(logs: Array, scale: Scalar, tests: Tests, linear: Linear) -> Scalar:
+        left, factor = without_own(Noise.from_logs(logs, scale), scale, tests, linear, zero_sd, correlation, along)
+        return factor - 0.5 * left[-1, -1]
+
+    return jax.vmap(lambda *test: jax.vmap(lambda one_noise: one(one_noise, *test))(logs))(scale, tests, linear)
+
+
+@compiled
+def effects_grams(
+    tests: Tests, linear: Linear, noise: Noise, zero_sd: Scalar, correlation: Correlation, along: Along
+) -> Float[Array, "particles q q"]:
+    """Gram matrix of the effects' columns and the residual of each test, the particle's numbers integrated out."""
+    return jax.vmap(lambda *test: without_own(noise, *test, zero_sd, correlation, along)[0])(noise.scale, tests, linear)
 
 
 STEP = 1e-3
@@ -343,8 +356,8 @@ class NoiseFit(eqx.Module):
 
 
 def estimate_noise(
-    tests: Parts,
-    linear: Parts,
+    tests: Tests,
+    linear: Linear,
     zero_sd: Scalar,
     prior: NoisePrior,
     start: Noise,
@@ -361,15 +374,14 @@ def estimate_noise(
     """
     from scipy.optimize import minimize
 
-    scale = blocks.cut(start.scale)
     # Without what is never read, so that all models share a program.
-    linear = linear.map(lambda wave: replace(wave, columns=wave.columns[..., :4], bends=None))
+    linear = replace(linear, columns=linear.columns[..., :4], bends=None)
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
         at = jnp.asarray(logs + DIFFERENCES)
-        each = blocks.all(likelihoods, at, scale, tests, linear, zero_sd, correlation, along, axis=1)
+        each = blocks.all(likelihoods, (start.scale, tests, linear), at, zero_sd, correlation, along)
         # Summed here, in one order, however the particles are spread.
-        values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(np.asarray(at)))
+        values = -(np.sum(np.asarray(each), axis=0) + prior.log_density(np.asarray(at)))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No instrument reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.

@@ -52,7 +52,7 @@ from .paper_steps import (
     strain_table,
 )
 from .results import Calibration
-from .sharding import filled_rows
+from .sharding import Blocks
 
 LARGEST_SHAPE_FACTOR = 4.0  # twice the paper's largest: shape factors beyond come from curves that do not collapse
 
@@ -427,16 +427,15 @@ def predict_particles(
         use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
         own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
     # Campaigns of similar size and length share one compilation.
-    rows = filled_rows(len(kept))
     points = [np.arange(len(campaign.curves[i])) for i in kept]
     longest = padded_length(max(map(len, points)))
     record = records_of(campaign, kept.tolist(), adjustment.segments, points, longest).record
-    records = jax.tree.map(lambda x: np.asarray(x)[rows], record)
-    sizes = particle_batch(campaign.diameters_um[kept[rows]])
-    plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(np.array(own)[rows].T))
-    same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
-    mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
-    by_mean, by_own = (np.asarray(responses(laws, sizes, records)) for laws in (mean, same))
+    sizes = particle_batch(campaign.diameters_um[kept])
+    C = np.array(own) ** (1 / np.array([1, 3, 5]))
+    mean = jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, len(kept))), law)
+    same = eqx.tree_at(lambda one: one.plastic, mean, Plastic(*jnp.asarray(C.T)))
+    blocks = Blocks(len(kept))
+    by_mean, by_own = (np.asarray(blocks.all(responses, (laws, sizes, record))) for laws in (mean, same))
     fits: list[ParticleFit | None] = [None] * len(campaign)
     for row, i in enumerate(kept):
         curve = campaign.curves[i]
@@ -448,7 +447,7 @@ def predict_particles(
                 touching[segment.start : segment.stop] = False
         used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max())) & curve.compared
         fits[i] = ParticleFit(
-            (float(plastic.C1[row]), float(plastic.C3[row]), float(plastic.C5[row])),
+            (float(C[row, 0]), float(C[row, 1]), float(C[row, 2])),
             float(curve.displacement_um[0] - measured[0]),
             measured,
             by_mean[row, : len(curve)],

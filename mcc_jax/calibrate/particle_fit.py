@@ -23,6 +23,9 @@ UNSEEN = 4.0  # a fit without unseen snap-through is preferred up to so many tim
 GAIN = 1e-6  # log probability still to gain at which a fit is finished, where residuals are as large as the noise
 
 
+snaps = compiled(jax.vmap(snap))
+
+
 class ParticleFits(eqx.Module):
     """Fits of single particles.
 
@@ -30,15 +33,11 @@ class ParticleFits(eqx.Module):
         point: where they ended.
         rms: root mean square residual [um].
         converged: whether the best start's fit met its tolerances.
-        ends: where the fit from each start ended: b1, b3, b5, e, zero and the amplitudes that vary.
-        settled: whether the fits from all starts met their tolerances.
     """
 
     point: Point
     rms: Float[Array, " particles"]
     converged: Bool[Array, " particles"]
-    ends: Float[Array, "particles starts p"]
-    settled: Bool[Array, " particles"]
 
 
 def linear_start(stress: np.ndarray, strain: np.ndarray) -> tuple[np.ndarray, float]:
@@ -71,7 +70,7 @@ def linear_start(stress: np.ndarray, strain: np.ndarray) -> tuple[np.ndarray, fl
 
 
 def linear_starts(tests: Tests, log_modulus: float) -> np.ndarray:
-    """Several starts for every particle, shape (starts, particles, 5): the linear one and variations of it."""
+    """Several starts for every particle, shape (particles, starts, 5): the linear one and variations of it."""
     force, displacement, loading, contact = (
         np.asarray(x) for x in (tests.force, tests.displacement, tests.loading, tests.contact)
     )
@@ -82,16 +81,16 @@ def linear_starts(tests: Tests, log_modulus: float) -> np.ndarray:
         stress = 1e3 * force[row, used] / (np.pi / 4 * reach[row] ** 2)
         first[row, :3], shift = linear_start(stress, (displacement[row, used] - contact[row]) / reach[row])
         first[row, 4] = contact[row] + shift * reach[row]
-    return first + np.pad(VARIATIONS, ((0, 0), (0, 2)))[:, None]
+    return first[:, None] + np.pad(VARIATIONS, ((0, 0), (0, 2)))
 
 
 def fit_particles(
     tests: Tests, noise: Any, centre: Any, width: Any, theta: Any, starts: Any, forms: Forms,
-    varying: tuple[int, ...] = (), most_steps: int = STEPS,
+    varying: tuple[int, ...] = (), block: int = 0,
 ) -> ParticleFits:  # fmt: skip
     """Fit every particle by itself, its modulus included, from several starts, by Levenberg's and Marquardt's method.
 
-    The law is linearised by the programs that every other fit uses, as many particles at a time as there are; a start
+    The law is linearised by the programs that every other fit uses, so many particles at a time as a block has; a start
     that has converged takes no further part.
 
     Args:
@@ -99,12 +98,12 @@ def fit_particles(
         centre, width: normal prior of each particle's b1, b3, b5, e, zero [um], and the amplitudes that vary, shape
             (particles, p).
         theta: numbers of the effects, shape (particles, numbers); those whose places are in `varying` are fitted.
-        starts: shape (starts, particles, p).
-        most_steps: give up after as many.
+        starts: shape (particles, starts, p).
+        block: particles of a block; all if 0.
     """
     noise, centre, width, theta, starts = (np.asarray(x) for x in (noise, centre, width, theta, starts))
-    (count, N, size), places = starts.shape, list(varying)
-    tests = jax.tree.map(np.asarray, tests)
+    (N, count, size), places = starts.shape, list(varying)
+    tests, block = jax.tree.map(np.asarray, tests), block or N
     points = np.maximum(tests.mask.sum(1), 1)
 
     def at(y: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,10 +111,10 @@ def fit_particles(
         own[:, places] = y[:, 5:]
         return y[:, :4], y[:, 4], own
 
-    def normal_equations(y: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Loss, gradient and curvature of some particles, as many as there are at most."""
-        filled = np.resize(np.arange(len(rows)), N)  # of one shape, for one compilation
-        some = tests if np.array_equal(rows, np.arange(N)) else jax.tree.map(lambda x: x[rows[filled]], tests)
+    def of_block(y: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Loss, gradient and curvature of some particles, as many as there are in a block at most."""
+        filled = np.resize(np.arange(len(rows)), block)  # of one shape, for one compilation
+        some = jax.tree.map(lambda x: x[rows[filled]], tests)
         residual, columns, _, _ = derivatives(*at(y[filled], rows[filled]), some, forms)
         ones = np.where(some.mask, 1.0, 0.0)[..., None]
         J = np.concatenate([columns[..., :4], ones, columns[..., [4 + k for k in places]]], -1)
@@ -131,15 +130,15 @@ def fit_particles(
         H = np.where(fine[:, None, None], H, np.eye(size))
         return np.where(fine, loss, np.inf), np.where(fine[:, None], g, 0.0), H
 
-    def every(y: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
-        cut = range(0, len(rows), N)
-        found = [normal_equations(y[k : k + N], rows[k : k + N]) for k in cut]
+    def normal_equations(y: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
+        found = [of_block(y[k : k + block], rows[k : k + block]) for k in range(0, len(rows), block)]
         return [np.concatenate(several) for several in zip(*found, strict=True)]
 
-    y, particle = starts.reshape(-1, size).astype(float), np.tile(np.arange(N), count)
-    loss, g, H = every(y, particle)
+    # All starts of all particles in a row, those of one start after those of another.
+    y, particle = np.moveaxis(starts, 1, 0).reshape(-1, size).astype(float), np.tile(np.arange(N), count)
+    loss, g, H = normal_equations(y, particle)
     damping, done = np.full(len(y), 1e-3), np.zeros(len(y), bool)
-    for _ in range(int(most_steps)):
+    for _ in range(STEPS):
         now = np.flatnonzero(~done)
         if not len(now):
             break
@@ -149,7 +148,7 @@ def fit_particles(
         # No logarithm moves by more than a factor of e, nothing else by more than its prior's width, at a time.
         most = np.abs(move / np.concatenate([np.ones((len(now), 4)), width[rows, 4:]], 1)).max(1)
         tried = y[now] + move / np.maximum(most, 1.0)[:, None]
-        new_loss, new_g, new_H = every(tried, rows)
+        new_loss, new_g, new_H = normal_equations(tried, rows)
         better = new_loss < loss[now]
         # What a step would still gain, in units of the scatter that there is: where the law does not describe the
         # curve, that is many times the noise.
@@ -169,10 +168,5 @@ def fit_particles(
     near = seen.min(0) < UNSEEN * loss.min(0) + UNSEEN
     best = np.where(near, seen, loss).argmin(0), np.arange(N)
     rms = noise * np.sqrt(2 * loss[best] / points)
-    point, *found = jax.tree.map(
-        jnp.asarray, (at(y[best], np.arange(N)), rms, done[best], np.moveaxis(y, 0, 1), done.all(0))
-    )
-    return ParticleFits(Point(*point), *found)
-
-
-snaps = compiled(jax.vmap(snap))
+    point, rms, converged = jax.tree.map(jnp.asarray, (at(y[best], np.arange(N)), rms, done[best]))
+    return ParticleFits(Point(*point), rms, converged)

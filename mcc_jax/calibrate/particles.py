@@ -25,7 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from .._types import Scalar
 from .compiling import compiled, even_batch, side_by_side
@@ -35,7 +35,7 @@ from .importance import MOST_PARETO_K, ordered_resample, pareto_k, relative_scat
 from .marginal import Marginal, ParticleDraw
 from .noise import Whitening
 from .population import Population
-from .sharding import Blocks, count_of
+from .sharding import Blocks
 
 # Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `bench_scale.py`).
 # A particle whose weight scatters by more than this share of its mean gets several candidates per draw; of many
@@ -85,15 +85,9 @@ class ExactLikelihood(eqx.Module):
     zero_prior: tuple[Scalar, Scalar]
     forms: Forms
 
-    def some(self, which: Int[Array, " chosen"]) -> ExactLikelihood:
+    def some(self, which: np.ndarray) -> ExactLikelihood:
         """Some of the tests."""
-
-        def chosen(tree):
-            return jax.tree.map(lambda x: x[which] if x.ndim else x, tree)
-
-        return ExactLikelihood(
-            chosen(self.tests), chosen(self.filters), chosen(self.marginal), self.zero_prior, self.forms
-        )
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]) if jnp.ndim(x) else x, self)
 
     def log_likelihood(self, population: Population, drawn: ParticleDraw) -> Float[Array, " particles"]:
         """Log likelihood of each test at drawn parameters, times the prior density of its zero."""
@@ -106,18 +100,18 @@ class ExactLikelihood(eqx.Module):
 
 @compiled
 def draw_particles(
-    keys: Key[Array, " 1"],
-    population: Population,
+    keys: UInt[Array, "particles data"],
     exact: ExactLikelihood,
+    population: Population,
     candidates: int = 1,
     common: bool | Bool[Array, ""] = False,
 ) -> ParticleDraws:
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
     Args:
-        keys: a single random key; with an axis, so that blocks of particles on several devices have one each.
-        population: draws, every field with a leading axis.
+        keys: data of one random key, for every particle.
         exact: the tests.
+        population: draws, every field with a leading axis.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
         common: use the same random numbers for every draw of the population.
     """
@@ -167,10 +161,12 @@ def draw_particles(
 
     rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
     batch = even_batch(draws, rows // (count * max(candidates, 1)))
-    each = jnp.where(common, keys, jax.random.split(keys[0], draws))
+    key = jax.random.wrap_key_data(keys[0])
+    each = jnp.where(common, key[None], jax.random.split(key, draws))
     # Arrays without an entry are left out: `map` cannot cut them in batches.
     latent, theta, *rest = jax.lax.map(one, (each, jnp.arange(draws)), batch_size=batch)
-    return ParticleDraws(latent, jnp.zeros((draws, count, 0)) if theta is None else theta, *rest)
+    found = latent, jnp.zeros((draws, count, 0)) if theta is None else theta, *rest
+    return ParticleDraws(*(jnp.swapaxes(x, 0, 1) for x in found))
 
 
 class Length(NamedTuple):
@@ -211,9 +207,8 @@ class Drawer:
 
     def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:
         """Cut the tests into blocks of so many particles."""
-        self.count = count_of(exact.tests)
-        self._exact, self._blocks, self._chunk = exact, Blocks(len(exact.tests), block), chunk
-        self._own = self._blocks.cut(exact, kept=False)
+        self.count = len(exact.tests)
+        self._exact, self._blocks, self._chunk = exact, Blocks(self.count, block), chunk
 
     def all(self, key: Array, population: Population, candidates: int = 1, *, common: bool = False) -> ParticleDraws:
         """All particles, with `candidates` and `common` of `draw_particles`."""
@@ -224,11 +219,11 @@ class Drawer:
             rows = np.minimum(np.arange(first, first + chunk), draws - 1)  # the last one pads the last chunk
             keys = blocks.keys(key if common or not first else jax.random.fold_in(key, first))
             some = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population)
-            found = blocks.all(draw_particles, keys, some, self._own, candidates, same, axis=1)
-            return [np.asarray(v)[:, : self.count] for v in found]
+            found = blocks.all(draw_particles, (keys, self._exact), some, candidates, same)
+            return [np.asarray(v).swapaxes(0, 1) for v in found]
 
         # Several processes exchange the numbers of their blocks, in one order.
-        found = (side_by_side if blocks.whole_here else map)(one, range(0, draws, chunk))
+        found = (side_by_side if blocks.number == 1 else map)(one, range(0, draws, chunk))
         return ParticleDraws(*(cast(Any, np.concatenate(several)[:draws]) for several in zip(*found, strict=True)))
 
     def some(
@@ -238,12 +233,11 @@ class Drawer:
         found = []
         for i in range(0, len(which), GROUP):
             group = which[i : i + GROUP]
-            # Always of one of a few sizes, the first one repeated: every size would be compiled again.
+            # Padded to one of a few sizes: every size would be compiled again.
             size = min(self.count, GROUP, 4 ** int(np.ceil(np.log(max(len(group), 2)) / np.log(4))))
-            padded = jnp.asarray(np.pad(group, (0, size - len(group)), constant_values=group[0]))
             own = jax.random.fold_in(key, 1000 * i + candidates)
-            drawn = Drawer(self._exact.some(padded), 0, self._chunk).all(own, population, candidates, common=common)
-            found.append([np.asarray(v)[:, : len(group)] for v in drawn])
+            few = Drawer(self._exact.some(group), size, self._chunk)
+            found.append(few.all(own, population, candidates, common=common))
         return ParticleDraws(*(cast(Any, np.concatenate(several, 1)) for several in zip(*found, strict=True)))
 
     def redraw(

@@ -315,16 +315,16 @@ def sample(
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
         selection, fit, size = prepare(campaign, model, threshold_MPa, start=begin, progress=progress)
         progress("sampling the population" if fast else "sampling everything")
-        key, kept = jax.random.key(seed), fit.first(len(selection.kept))
+        key = jax.random.key(seed)
         if fast:
             plausible = worst(check_plausibility(campaign)) != "error"
             drawn = draw_fast(key, fit, length, size, fallback=plausible)
         else:
-            drawn = draw_joint(key, kept, length)
+            drawn = draw_joint(key, fit, length)
     progress("diagnosing")
     settings: dict[str, Any] = {"mode": mode, "seed": seed}
     found = Posterior(
-        campaign=campaign, selection=selection, model=fit.model, fit=kept, runtime_s=0.0, **settings, **drawn
+        campaign=campaign, selection=selection, model=fit.model, fit=fit, runtime_s=0.0, **settings, **drawn
     )
 
     def again(some: Campaign) -> dict[str, Any]:

@@ -13,8 +13,7 @@ processor's devices share its threads, and sums are divided otherwise. Their dra
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -24,12 +23,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from .._errors import InputError
+from ..arguments import is_traced
 from .compiling import compiled
-from .data import Tests, longer
+from .data import Tests
 
-AXIS = "particles"
-"""Name of the only axis of the mesh of a process's devices."""
-
+AXIS = "particles"  # the only axis of the mesh of a process's devices
 
 # Sizes of a campaign that is one block: those between are padded, so that few sizes are compiled. The last is the
 # most particles of a block: on a processor larger ones are no faster, smaller ones slower (`bench_scale.py`).
@@ -45,171 +43,94 @@ def block_size(count: int) -> int:
     return size + -size % 4
 
 
-def filled_rows(count: int) -> np.ndarray:
-    """Rows 0 to `count` - 1, and the last one again until blocks are full: few numbers of rows, few compilations."""
-    return np.minimum(np.arange(count + -count % block_size(count)), count - 1)
+def padded(tree: Any) -> tuple[Any, np.ndarray]:
+    """Arrays of particles with copies of the last one up to whole blocks, and weights: 1 of particles, 0 of copies."""
+    count = len(jax.tree.leaves(tree)[0])
+    rows = np.arange(count + -count % block_size(count))
 
+    def longer(x: Any) -> Any:
+        x = x if is_traced(x) else np.asarray(x)  # of NumPy, so that nothing is compiled
+        return jnp.asarray(x[np.minimum(rows, count - 1)])
 
-def filled_up(tests: Tests, block: int) -> Tests:
-    """The same tests among as many more as whole blocks take: copies of the last particle that count for nothing.
-
-    Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
-    """
-    more = -len(tests) % block
-    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
-    return replace(longer(tests, len(tests) + more), weight=jnp.asarray(np.pad(weight, (0, more))))
-
-
-def count_of(tests: Tests) -> int:
-    """Number of particles, without padding."""
-    return len(tests) if tests.weight is None else int(np.asarray(tests.weight).sum())
-
-
-@dataclass(frozen=True)
-class Parts:
-    """This process's own particles, cut along `axis` into waves: a block for each of its devices at the same time."""
-
-    waves: Sequence[Any]
-    axis: int = 0
-
-    def map(self, function: Callable[..., Any], *others: Parts) -> Parts:
-        """A function of every wave, and of the same waves of others."""
-        several = zip(self.waves, *(one.waves for one in others), strict=True)
-        return Parts(tuple(function(*waves) for waves in several), self.axis)
-
-
-@dataclass(frozen=True)
-class _Cut(Sequence[Any]):
-    """Waves that are cut out each time they are asked for: `part` of each row of blocks in `own`."""
-
-    part: Callable[[np.ndarray], Any]
-    own: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.own)
-
-    def __getitem__(self, wave: Any) -> Any:
-        return self.part(self.own[wave])
+    return jax.tree.map(longer, tree), np.where(rows < count, 1.0, 0.0)
 
 
 class Blocks:
-    """How `count` particles, padding included, are cut into `number` blocks of `size`; which are this process's own."""
+    """`count` particles in `number` blocks of `size`, the last one padded, of which each process has its own."""
 
     def __init__(self, count: int, size: int = 0) -> None:
-        """Cut `count` particles into blocks of `size`; 0 for a single block.
-
-        Raises:
-            ValueError: if the blocks do not come out even.
-        """
-        self.count, self.size = count, size or count
-        if self.count % self.size:
-            raise ValueError(f"{count} particles are not a whole number of blocks of {size}")
-        self.number = self.count // self.size
+        """Cut `count` particles into blocks of `size`; of `block_size` if 0."""
+        self.count, self.size = count, size or block_size(count)
+        self.number = -(-count // self.size)
         # A single block is computed by every process for itself: that is quicker than to wait for another's.
         self.processes = jax.process_count() if self.number > 1 else 1
         process = jax.process_index() if self.processes > 1 else 0
-        share = -(-self.number // self.processes)
+        self._share = share = -(-self.number // self.processes)
         devices = jax.local_devices()[:share]
-        self.mesh = Mesh(np.array(devices), (AXIS,)) if len(devices) > 1 else None
-        self._share = share
+        self._mesh = Mesh(np.array(devices), (AXIS,)) if len(devices) > 1 else None
         rounds = -(-share // len(devices))
         # Where blocks do not come out even, the last one is computed again, and discarded.
         own = np.minimum(process * share + np.minimum(np.arange(rounds * len(devices)), share - 1), self.number - 1)
         self._own = own.reshape(rounds, len(devices))
 
-    @property
-    def whole_here(self) -> bool:
-        """Whether one device of every process has all particles at once."""
-        return self.number == 1
-
-    def cut(self, tree: Any, axis: int = 0, *, kept: bool = True) -> Parts:
-        """This process's own particles of arrays of all; numbers without axes stay as they are.
-
-        Parts that are not kept are cut out each time they are asked for: of very many particles a second copy of all
-        would be large.
-        """
-        if self.whole_here:
-            return Parts((tree,), axis)
-
-        def part(blocks: np.ndarray) -> Any:
-            rows = (blocks[:, None] * self.size + np.arange(self.size)[None]).ravel()
-            return jax.tree.map(
-                lambda x: x if jnp.ndim(x) == 0 else self._placed(np.take(np.asarray(x), rows, axis), axis), tree
-            )
-
-        return Parts(tuple(map(part, self._own)) if kept else _Cut(part, self._own), axis)
-
-    def keys(self, key: Any) -> Parts:
-        """A random key for every block."""
-        if self.whole_here:
-            return Parts((key[None],))
-        data = np.asarray(jax.random.key_data(jax.random.split(key, self.number)))
-        return Parts(tuple(jax.random.wrap_key_data(self._placed(data[blocks], 0)) for blocks in self._own))
-
-    def each(self, function: Callable[..., Any], *arguments: Any, axis: int = 0) -> Parts:
-        """A function of one block, applied to all of this process's own.
+    def all(self, function: Callable[..., Any], particles: tuple[Any, ...], *shared: Any) -> Any:
+        """`function(*particles, *shared)` of all particles, a block at a time on each device.
 
         Args:
             function: from `compiled`, for all devices at once; any other calls compiled functions one after the other.
-            arguments: `Parts`, or what all blocks share.
-            axis: of the particles in every array of the result.
+            particles: trees of arrays with the particles first, as those of the result; numbers without axes are left.
+            shared: what does not depend on the particles.
         """
+        if self.number == 1 and self.size == self.count:
+            return function(*particles, *shared)
+        mesh = self._mesh if hasattr(function, "__wrapped__") else None
+        placed = jnp.asarray if mesh is None else lambda x: jax.device_put(x, NamedSharding(mesh, PartitionSpec(AXIS)))
 
-        def wave(w: int) -> Any:
-            chosen = tuple(a.waves[w] if isinstance(a, Parts) else a for a in arguments)
-            if self.mesh is None or not hasattr(function, "__wrapped__"):
-                return function(*chosen)
-            axes = tuple(a.axis if isinstance(a, Parts) else -1 for a in arguments)
-            return _on_all_devices(chosen, axes, axis, function, self.mesh)
+        def some(blocks: np.ndarray) -> Any:
+            rows = self._rows(blocks)
+            own = jax.tree.map(lambda x: placed(np.asarray(x)[rows]) if np.ndim(x) else x, particles)
+            return function(*own, *shared) if mesh is None else _on_all_devices(own, shared, function, mesh)
 
-        return Parts(tuple(wave(w) for w in range(len(self._own))), axis)
+        return self._gathered([some(blocks) for blocks in self._own])
 
-    def all(self, function: Callable[..., Any], *arguments: Any, axis: int = 0) -> Any:
-        """The same, of all particles."""
-        return self.whole(self.each(function, *arguments, axis=axis))
+    def share(self, function: Callable[..., Any], particles: tuple[Any, ...], *shared: Any) -> Any:
+        """The same, of all particles of this process in one call; for a function that cuts them into blocks itself."""
+        rows = self._rows(self._own.ravel())
+        return self._gathered([function(*jax.tree.map(lambda x: np.asarray(x)[rows], particles), *shared)])
 
-    def whole(self, parts: Parts) -> Any:
+    def keys(self, key: Any) -> np.ndarray:
+        """Data of a random key for every block, for each of its particles."""
+        keys = key[None] if self.number == 1 else jax.random.split(key, self.number)
+        return np.repeat(np.asarray(jax.random.key_data(keys)), self.size, axis=0)[: self.count]
+
+    def _rows(self, blocks: np.ndarray) -> np.ndarray:
+        return np.minimum((blocks[:, None] * self.size + np.arange(self.size)).ravel(), self.count - 1)
+
+    def _gathered(self, parts: list[Any]) -> Any:
         """Arrays of all particles, the same bits on every process, from each process's own."""
-        if self.whole_here:
-            return parts.waves[0]
-        axis, own = parts.axis, self._share * self.size
-        trees = [jax.tree.flatten(wave) for wave in parts.waves]
-        waves = zip(*(leaves for leaves, _ in trees), strict=True)
-        leaves = [_first(np.concatenate([np.asarray(v) for v in several], axis), own, axis) for several in waves]
+        own = self._share * self.size
+        whole = jax.tree.map(lambda *several: np.concatenate(list(map(np.asarray, several)))[:own], *parts)
         if self.processes > 1:
-            leaves = [np.concatenate(several, axis) for several in zip(*_exchanged(leaves), strict=True)]
-        return jax.tree.unflatten(trees[0][1], [jnp.asarray(_first(x, self.count, axis)) for x in leaves])
-
-    def _placed(self, x: np.ndarray, axis: int) -> Any:
-        if self.mesh is None:
-            return jnp.asarray(x)
-        return jax.device_put(x, NamedSharding(self.mesh, _along(axis)))
-
-
-def _first(x: np.ndarray, count: int, axis: int) -> np.ndarray:
-    return x[(slice(None),) * axis + (slice(count),)]
-
-
-def _along(axis: int) -> PartitionSpec:
-    return PartitionSpec(*[None] * axis, AXIS)
+            leaves, structure = jax.tree.flatten(whole)
+            leaves = [np.concatenate(several) for several in zip(*_exchanged(leaves), strict=True)]
+            whole = jax.tree.unflatten(structure, leaves)
+        return jax.tree.map(lambda x: jnp.asarray(x[: self.count]), whole)
 
 
 @compiled
-def _on_all_devices(arguments: Any, axes: Any, axis: int, function: Any, mesh: Any) -> Any:
+def _on_all_devices(particles: Any, shared: Any, function: Any, mesh: Any) -> Any:
     """A function of one block on every device of a mesh, each with a block of its own."""
-    arrays, rest = eqx.partition(arguments, eqx.is_array)
-    places = tuple(
-        jax.tree.map(lambda x, a=a: _along(a) if a >= 0 and x.ndim else PartitionSpec(), one)
-        for one, a in zip(arrays, axes, strict=True)
+    arrays, rest = eqx.partition((particles, shared), eqx.is_array)
+    cut = jax.tree.map(lambda x: PartitionSpec(AXIS) if x.ndim else PartitionSpec(), arrays[0])
+    whole = jax.tree.map(lambda _: PartitionSpec(), arrays[1])
+
+    def run(arrays: Any) -> Any:
+        own, common = eqx.combine(arrays, rest)
+        return function(*own, *common)
+
+    return jax.shard_map(run, mesh=mesh, in_specs=((cut, whole),), out_specs=PartitionSpec(AXIS), check_vma=False)(
+        arrays
     )
-    run = jax.shard_map(
-        lambda own: function(*eqx.combine(own, rest)),
-        mesh=mesh,
-        in_specs=(places,),
-        out_specs=_along(axis),
-        check_vma=False,
-    )
-    return run(arrays)
 
 
 def _exchanged(arrays: list[np.ndarray]) -> list[list[np.ndarray]]:

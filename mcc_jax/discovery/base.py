@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Progress
-from ..calibrate.data import Selection, Tests, longer, ranges_um, root_mean_squares
+from ..calibrate.data import Selection, Tests, ranges_um, root_mean_squares
 from ..calibrate.fitting import in_own_units, prepare
 from ..calibrate.forward import Forms, Point, snap
 from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.model import Model
 from ..calibrate.priors import SpreadCoordinate
-from ..calibrate.sharding import Blocks, Parts
+from ..calibrate.sharding import Blocks
 from ..campaign import Campaign, find_segments
 from .settings import DECISIONS
 
@@ -101,18 +101,9 @@ class Base:
         factor[3, 2], factor[3, 4], factor[3, 3] = factor[2, 2] / 6, 5 * factor[4, 4] / 6, p.softening.log_sd / 6
         return mean, factor
 
-    @cached_property
-    def blocks(self) -> tuple[Blocks, Parts]:
-        """How particles are cut into blocks, and the tests so cut."""
-        count = len(self.tests) + -len(self.tests) % BLOCK
-        blocks = Blocks(count, BLOCK)
-        return blocks, blocks.cut(longer(self.tests, count))
-
     def each(self, function: Callable[..., Any], point: Point, *shared: Any) -> Any:
         """A compiled function of points and tests, block by block: it is compiled once for any number of particles."""
-        blocks, tests = self.blocks
-        found = blocks.whole(blocks.each(function, blocks.cut(longer(point, blocks.count)), tests, *shared))
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[: len(self.tests)]), found)
+        return Blocks(len(self.tests), BLOCK).all(function, (point, self.tests), *shared)
 
     def name_of(self, row: int) -> str:
         """The particle of a row of the tests."""
@@ -149,14 +140,12 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress
     with numbers_in_reach(campaign):
         model, foreign = in_own_units(campaign, model)
         selection, fit, _ = prepare(campaign, model, threshold_MPa, progress=progress)
-        fit = fit.first(len(selection.kept))
         share = np.median(root_mean_squares(fit.tests, fit.residual) / ranges_um(fit.tests))
         coarse = foreign is not None and bool(share > DECISIONS.foreign_misfit)
         if coarse:
             branches = int(np.median([len(find_segments(curve)) for curve in campaign.curves]))
             most = DECISIONS.readings * branches
             selection, fit, _ = prepare(campaign, model, threshold_MPa, most_points=most, progress=progress)
-            fit = fit.first(len(selection.kept))
     p = fit.population
     shift = float(jnp.mean(jnp.log1p(p.a * fit.tests.flatness)))
     population = jnp.concatenate([jnp.stack([p.a, p.log_modulus]), p.mu + shift])

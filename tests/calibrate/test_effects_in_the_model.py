@@ -11,10 +11,9 @@ from scipy.special import logsumexp
 
 import mcc_jax as mcc
 from mcc_jax.calibrate.forward import Point, residuals
-from mcc_jax.calibrate.linearisation import Linearisation
+from mcc_jax.calibrate.linearisation import Linearisation, coordinates
 from mcc_jax.calibrate.marginal import straighten, with_products
 from mcc_jax.calibrate.sharding import Blocks
-from mcc_jax.calibrate.straightening import coordinates
 from mcc_jax.effects import find_variant
 
 pytestmark = pytest.mark.extended
@@ -72,9 +71,8 @@ def test_what_did_not_come_to_rest_is_told_from_what_does_not_fit(posterior):
 def second_order_misses(posterior, sd, away):
     """What of a change of all numbers the columns leave, and what columns and bends leave, over the change."""
     fit, model = posterior.fit, posterior.model
-    blocks = Blocks(len(fit.tests))
-    linearisation = Linearisation(blocks.cut(fit.tests), len(fit.tests), model, blocks)
-    (linear,) = linearisation.at(fit.point, sd).waves
+    linearisation = Linearisation(fit.tests, model.forms, model.scatter.positive, Blocks(len(fit.tests)))
+    linear = linearisation.at(fit.point, sd)
     latent, theta = fit.point.latent + away[None, :4], fit.point.theta * jnp.exp(away[4:])[None]
     moved = residuals(Point(latent, fit.point.zero, theta), fit.tests, model.forms)
     straight, _ = straighten(jnp.broadcast_to(away[:4], latent.shape))

@@ -170,7 +170,7 @@ def test_the_start_lands_near_the_truth(offset):
     tests = measured_with()
     reach = jnp.asarray(effective_diameter(DIAMETERS))
     contact = tests.contact + offset * reach
-    first = linear_starts(replace(tests, contact=contact), 9.0)[0]
+    first = linear_starts(replace(tests, contact=contact), 9.0)[:, 0]
     ratio = np.exp(first[:, :3] - true_latent()[:, :3])
     assert np.all(np.abs(ratio - 1) < 0.2), ratio
     assert np.all(np.abs(first[:, 4]) < 0.004 * np.asarray(reach))

@@ -101,8 +101,8 @@ def test_no_snap_through_is_put_where_nothing_shows_it():
 
     alone = fit(tests, 0.03)
     assert unseen(alone.point.latent).any()  # no start led anywhere else: there is nothing better to say
-    steep = jnp.asarray([9.0, 2.5, 4.5, 12.0, 0.0])
-    both = jnp.concatenate([jnp.moveaxis(alone.ends, 1, 0), jnp.broadcast_to(steep, (1, len(tests), 5))])
+    here = np.column_stack([alone.point.latent, alone.point.zero])
+    both = np.stack([here, np.broadcast_to([9.0, 2.5, 4.5, 12.0, 0.0], here.shape)], 1)
     found = fit(tests, 0.03, starts=both)
     assert not unseen(found.point.latent).any()
     assert np.all(np.asarray(found.rms) > 0.999 * np.asarray(alone.rms))

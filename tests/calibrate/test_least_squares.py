@@ -76,7 +76,8 @@ def test_nothing_is_open_and_all_starts_agree(content):
 
 def dense(result):
     """The pooled residuals as a function of one vector."""
-    residual = pooled_residual(result.settings, result.selection.tests)
+    weight = jnp.ones(len(result.selection.tests))
+    residual = pooled_residual(result.settings, result.selection.tests, weight)
     count, own = np.asarray(result.solution.value.local).shape
 
     @jax.jit

@@ -23,10 +23,10 @@ from scipy.stats import multivariate_normal
 
 from mcc_jax import Model
 from mcc_jax.calibrate.forward import Point
+from mcc_jax.calibrate.linearisation import Straight
 from mcc_jax.calibrate.marginal import Marginal, summarise
 from mcc_jax.calibrate.noise import Along, Correlation, Noise
 from mcc_jax.calibrate.population import Scatter, moments
-from mcc_jax.calibrate.straightening import Straight
 from mcc_jax.campaign import particle_batch
 from mcc_jax.law import StrainScaling
 

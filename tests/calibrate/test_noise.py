@@ -18,8 +18,8 @@ from mcc_jax.calibrate.noise import (
     Noise,
     Whitening,
     estimate_noise,
+    likelihoods,
     particle_scales,
-    restricted_likelihood,
     whitening,
 )
 from mcc_jax.calibrate.priors import NoisePrior
@@ -165,7 +165,7 @@ def test_restricted_likelihood_is_the_dense_normal_one_with_the_numbers_in_the_c
     rng = np.random.default_rng(0)
     tests, linear = random_tests(rng, count=2)
     noise, zero_sd = Noise.of(FOUR, jnp.asarray([scale, 1.0])), 1.5
-    actual = np.asarray(jax.jit(lambda: restricted_likelihood(noise, tests, linear, jnp.asarray(zero_sd), *KINDS[0]))())
+    actual = likelihoods(noise.scale, tests, linear, noise.logs[None], jnp.asarray(zero_sd), *KINDS[0])[:, 0]
     for i in range(2):
         mask = np.asarray(tests.mask[i])
         X = np.concatenate([np.asarray(linear.columns[i]), np.full((POINTS, 1), zero_sd)], 1)
@@ -203,8 +203,7 @@ def known_tests(four, scale):
 
 def estimate(tests, linear, start, **options):
     blocks = Blocks(COUNT)
-    parts = blocks.cut(tests), blocks.cut(linear)
-    return estimate_noise(*parts, jnp.asarray(2.0), WEAK, start, *KINDS[0], blocks=blocks, **options)
+    return estimate_noise(tests, linear, jnp.asarray(2.0), WEAK, start, *KINDS[0], blocks=blocks, **options)
 
 
 @pytest.fixture(scope="module")
@@ -228,13 +227,9 @@ def test_known_noise_is_recovered(estimated):
 def test_the_estimate_is_the_maximum_and_its_volume_laplace_s(estimated):
     tests, linear, start, found = estimated
 
-    @jax.jit
-    def likelihood(logs):
-        noise = Noise.from_logs(logs, start.scale)
-        return jnp.sum(restricted_likelihood(noise, tests, linear, jnp.asarray(2.0), *KINDS[0]))
-
     def loss(logs):
-        return -(float(likelihood(jnp.asarray(logs))) + float(WEAK.log_density(logs)))
+        each = likelihoods(start.scale, tests, linear, jnp.asarray(logs)[None], jnp.asarray(2.0), *KINDS[0])
+        return -(float(jnp.sum(each)) + float(WEAK.log_density(logs)))
 
     best = np.asarray(found.noise.logs)
     for direction in np.eye(4):

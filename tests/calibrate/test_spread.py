@@ -10,11 +10,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from joint_cases import NOISE, Programme, five_tests, simulated
+from joint_cases import five_tests
+from spread_run import squares
 
-from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.sharding import BLOCKS, Blocks, Parts, block_size, count_of, filled_up
-from mcc_jax.calibrate.straightening import products
+from mcc_jax.calibrate.sharding import BLOCKS, Blocks, block_size, padded
 
 pytestmark = pytest.mark.extended
 
@@ -94,13 +93,11 @@ def assert_same(found, wanted):
 def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
     port = free_port()
     finish(tmp_path, [start(tmp_path, 2, 2, i, port, everything=False) for i in range(2)])
-    alone = Blocks(6, 2)
-    here = alone.cut(filled_up(five_tests(), 2).force[:, None])
-    wanted = alone.all(products, here)
+    wanted = squares(five_tests().force)
     for process in range(2):
         told = json.loads((tmp_path / f"devices_{process}.json").read_text())
         assert told == {"devices": 2, "processes": 2}
-        np.testing.assert_allclose(arrays(tmp_path, process)["starts"], wanted, rtol=1e-8)
+        np.testing.assert_allclose(arrays(tmp_path, process)["squares"], wanted, rtol=1e-8)
 
 
 @pytest.mark.parametrize("process", [0, 1])
@@ -150,36 +147,31 @@ def test_blocks_waste_little_and_have_few_sizes(count):
     assert block_size(filled) == size  # what is filled up once stays as it is
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_what_is_cut_makes_up_the_whole(axis):
-    rng = np.random.default_rng(1)
-    blocks = Blocks(12, 4)
-    matrix = np.moveaxis(rng.standard_normal((12, 3)), 0, axis)
-    tree = {"matrix": matrix, "whole numbers": np.arange(12), "number": np.float64(2.0)}
-    parts = blocks.cut(tree if axis == 0 else {"matrix": matrix}, axis)
-    assert len(parts.waves) == blocks.number == 3
-    assert {wave["matrix"].shape[axis] for wave in parts.waves} == {4}
-    whole = blocks.whole(Parts(tuple({k: v for k, v in w.items() if k != "number"} for w in parts.waves), axis))
-    for name, values in whole.items():
-        np.testing.assert_array_equal(values, tree[name])
+def test_blocks_make_up_the_whole():
+    """Of six particles in blocks of four the last is padded; numbers without axes are not cut."""
+    tree = {"matrix": np.random.default_rng(1).standard_normal((6, 3)), "number": np.float64(2.0)}
+    sizes = []
+
+    def function(own, shared):
+        sizes.append(len(own["matrix"]))
+        return {"matrix": own["matrix"] * own["number"] + shared, "first": own["matrix"][:, 0]}
+
+    blocks = Blocks(6, 4)
+    for found, wanted in ((blocks.all(function, (tree,), 1.0), [4, 4]), (blocks.share(function, (tree,), 1.0), [8])):
+        assert sizes == wanted
+        sizes.clear()
+        np.testing.assert_array_equal(found["matrix"], 2 * tree["matrix"] + 1)
+        np.testing.assert_array_equal(found["first"], tree["matrix"][:, 0])
 
 
-def test_blocks_that_do_not_come_out_even_are_told():
-    with pytest.raises(ValueError, match="whole number of blocks"):
-        Blocks(5, 2)
-
-
-def test_what_fills_up_counts_for_nothing():
-    tests = select_tests(simulated(instrument=NOISE, programme=Programme.cycles(points=40)))
-    filled = filled_up(tests, 3)
-    assert (len(tests), len(filled), count_of(tests), count_of(filled)) == (4, 6, 4, 4)
-    np.testing.assert_array_equal(filled.weight, [1, 1, 1, 1, 0, 0])
-    np.testing.assert_array_equal(filled.force[4:], np.asarray(tests.force)[[3, 3]])
-    np.testing.assert_array_equal(filled_up(tests, 2).weight, np.ones(4))
+def test_padding_counts_for_nothing():
+    found, weight = padded(np.arange(5.0))
+    np.testing.assert_array_equal(found, [0, 1, 2, 3, 4, 4, 4, 4])
+    np.testing.assert_array_equal(weight, [1, 1, 1, 1, 1, 0, 0, 0])
 
 
 def test_every_block_has_random_numbers_of_its_own():
-    blocks = Blocks(6, 2)
-    keys = np.concatenate([jax.random.key_data(wave) for wave in blocks.keys(jax.random.key(0)).waves])
-    assert keys.shape == (3, 2)
+    keys = Blocks(5, 2).keys(jax.random.key(0))
+    assert keys.shape == (5, 2)
+    np.testing.assert_array_equal(keys[0], keys[1])
     assert len(np.unique(keys, axis=0)) == 3
