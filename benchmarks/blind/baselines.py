@@ -78,7 +78,7 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
         forms = Forms(unloading, variants)
         start = jnp.asarray(forms.without_effects)
         point = Point(latent, zero, jnp.broadcast_to(start, (len(latent), len(start))))
-        return np.asarray(_linearise()(point, tests, forms, with_force=False).columns)[:count]
+        return np.asarray(_linearise()(point, tests, forms).columns)[:count]
 
     rows = [np.flatnonzero(mask) for mask in np.asarray(fit.tests.mask)]
     base = columns(())

@@ -19,6 +19,7 @@ from .compiling import compiled
 from .data import MOST_POINTS, padded_length, records_of, rows_from_contact
 from .estimates import Variants, laws_of
 from .population import COEFFICIENTS
+from .sharding import Blocks
 
 KINDS = ("load", "hold", "unload", "reload")
 
@@ -62,7 +63,10 @@ class FittedCurve:
 
 def measured_curves(campaign: Campaign) -> tuple[FittedCurve, ...]:
     """The tests of a campaign that nobody calibrated."""
-    return tuple(_measured(campaign, i, parts, None) for i, parts in enumerate(campaign_segments(campaign)))
+    return tuple(
+        _measured(campaign, i, parts, *_all_rows(campaign, i, parts))
+        for i, parts in enumerate(campaign_segments(campaign))
+    )
 
 
 def fitted_curves(
@@ -72,64 +76,60 @@ def fitted_curves(
     predictions: Callable[[str], np.ndarray | None],
     variants: Variants | None = None,
 ) -> tuple[FittedCurve, ...]:
-    """The tests of a campaign with what its calibrated law predicts. Needs double precision, as calibration does."""
+    """The tests of a campaign with what its calibrated law predicts. Needs double precision, as calibration does.
+
+    `compared` are, by place, the rows of the curves of particles that took part, and which of them are compared;
+    `predictions` gives draws of what may be measured of a particle at its rows [um].
+    """
     segments = campaign_segments(campaign)
-    shown = [_measured(campaign, i, parts, compared.get(i)) for i, parts in enumerate(segments)]
     entries = {entry["particle"]: entry for entry in content["particles"]}
-    curves = [replace(one, why_not=entries[one.name]["why_not"]) for one in shown]
-    rows = [i for i, one in enumerate(curves) if _known(entries[one.name])]
+    chosen = [compared.get(i) or _all_rows(campaign, i, parts) for i, parts in enumerate(segments)]
+    curves = [_measured(campaign, i, parts, *chosen[i]) for i, parts in enumerate(segments)]
+    curves = [replace(one, why_not=entries[one.name]["why_not"]) for one in curves]
+    known = {n: e["kept"] and all(e[c]["value"] is not None for c in COEFFICIENTS) for n, e in entries.items()}
+    rows = [i for i, one in enumerate(curves) if known[one.name]]
     if not rows:
         return tuple(curves)
-    used = [compared[i][0] if i in compared else _rows(campaign, i, segments[i]) for i in rows]
-    # Campaigns of similar length share one compilation.
-    records = records_of(campaign, rows, segments, used, padded_length(max(map(len, used)))).record
+    # Campaigns of similar size and length share one compilation.
+    longest = padded_length(max(len(chosen[i][0]) for i in rows))
+    record, _, _ = records_of(campaign, rows, segments, [chosen[i][0] for i in rows], longest)
     sizes = campaign.diameters_um[rows]
     both = laws_of(content, [curves[i].name for i in rows], sizes, variants)
-    own, typical = (np.asarray(responses(laws, particle_batch(sizes), records)) for laws in both)
+    blocks = Blocks(len(rows))
+    own, typical = (np.asarray(blocks.all(responses, (laws, particle_batch(sizes), record))) for laws in both)
     for row, own_um, typical_um in zip(rows, own, typical, strict=True):
         one, zero = curves[row], entries[curves[row].name]["zero_um"]["value"] or 0.0
         length = len(one.kind)
         one = replace(one, own_um=own_um[:length] + zero, typical_um=typical_um[:length] + zero)
-        curves[row] = _with_band(one, predictions(one.name)) if row in compared else one
+        draws = predictions(one.name) if row in compared else None
+        if draws is not None:
+            # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
+            centre, half = draws.mean(0), 1.96 * draws.std(0)
+            low, high = (np.where(one.used, centre + sign * half, np.nan) for sign in (-1, 1))
+            # Means of coefficients are not the coefficients of the mean.
+            one = replace(one, own_um=np.where(one.used, centre, one.own_um), low_um=low, high_um=high)
+        curves[row] = one
     return tuple(curves)
 
 
-def _known(entry: Mapping[str, Any]) -> bool:
-    return entry["kept"] and all(entry[name]["value"] is not None for name in COEFFICIENTS)
+def _all_rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """All rows of a test from contact on, thinned, all of them compared."""
+    rows = rows_from_contact(campaign.curves[i], segments, MOST_POINTS)
+    return rows, np.ones(len(rows), bool)
 
 
 def _measured(
-    campaign: Campaign, i: int, segments: tuple[Segment, ...], compared: tuple[np.ndarray, np.ndarray] | None
+    campaign: Campaign, i: int, segments: tuple[Segment, ...], rows: np.ndarray, used: np.ndarray
 ) -> FittedCurve:
-    curve = campaign.curves[i]
+    curve, nothing = campaign.curves[i], np.full(len(rows), np.nan)
     kind = np.zeros(len(curve), int)
     for part in segments:
         kind[part.start : part.stop] = KINDS.index(part.kind) if part.kind in KINDS else 0
-    if compared is None:
-        rows = _rows(campaign, i, segments)
-        compared = rows, np.ones(len(rows), bool)
-    rows, used = compared
-    nothing = np.full(len(rows), np.nan)
     measured = curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows]
     return FittedCurve(campaign.particles[i], None, *measured, kind[rows], used, nothing, nothing, nothing, nothing)
-
-
-def _rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> np.ndarray:
-    return rows_from_contact(campaign.curves[i], segments, MOST_POINTS)
 
 
 @compiled
 def responses(laws: MccLaw, particles: Particle, records: Record) -> Array:
     """Displacement [um] of particles by a law each, along a record each, shape (N, points)."""
     return jax.vmap(lambda law, *one: law.respond(*one))(laws, particles, records)
-
-
-def _with_band(one: FittedCurve, draws: np.ndarray | None) -> FittedCurve:
-    """The central 95 % of what may be measured, and the middle of it, where points are compared."""
-    if draws is None:
-        return one
-    # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
-    centre, half = draws.mean(0), 1.96 * draws.std(0)
-    middle = np.where(one.used, centre, one.own_um)  # means of coefficients are not the coefficients of the mean
-    low, high = (np.where(one.used, centre + sign * half, np.nan) for sign in (-1, 1))
-    return replace(one, own_um=middle, low_um=low, high_um=high)

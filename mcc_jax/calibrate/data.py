@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -188,21 +188,21 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         return np.stack([np.pad(v, (0, longest - len(v)), mode=mode) for v in values])
 
     curves = [campaign.curves[i] for i in kept]
-    records = records_of(campaign, kept, segments, [one.rows for one in used], longest)
-    force, levels = np.asarray(records.record.force), np.asarray(records.record.peak)
-    branch = _branches(levels, records.error > 0)
+    record, reading, error = records_of(campaign, kept, segments, [one.rows for one in used], longest)
+    force = np.asarray(record.force)
+    branch = _branches(np.asarray(record.peak), error > 0)
     changes = np.abs(np.diff(force, axis=1, prepend=force[:, :1]))
     tests = Tests(
         particle_batch(campaign.diameters_um[list(kept)]),
-        records.record,
+        record,
         jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
         jnp.asarray(padded([one.mask for one in used])),
         jnp.asarray(padded([one.loading for one in used])),
         jnp.asarray([one.contact for one in used]),
         jnp.asarray(np.cumsum(changes, axis=1) / force.max(axis=1, keepdims=True)),
         jnp.asarray(branch),
-        jnp.asarray(records.reading),
-        jnp.asarray(records.error),
+        jnp.asarray(reading),
+        jnp.asarray(error),
         *_errors_of_force(curves, used, branch),
     )
     return Selection(
@@ -239,35 +239,29 @@ def _branches(levels: np.ndarray, elastic: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(np.where(same, 0, np.arange(levels.shape[1])), axis=1)
 
 
-class Records(NamedTuple):
-    """What the instruments did, as laws and noise see it, with forces and peaks of `turning_forces`; (N, points)."""
-
-    record: Record
-    reading: np.ndarray
-    error: np.ndarray
-
-
 def records_of(
     campaign: Campaign,
     places: Sequence[int],
     segments: Sequence[tuple[Segment, ...]],
     rows: Sequence[np.ndarray],
     longest: int,
-) -> Records:
-    """Records of the tests at some places of a campaign, at some rows of each, padded with the last to a length."""
+) -> tuple[Record, np.ndarray, np.ndarray]:
+    """Records of the tests at some places of a campaign, at some rows of each, padded with the last to a length.
+
+    Forces and peaks are those of `turning_forces`; the arrays are its `reading` and `error`, shape (N, points).
+    """
     humidity = humidities(campaign)
-    records, reading, error = [], [], []
+    found = []
     for i, some in zip(places, rows, strict=True):
         own = None if humidity is None else float(humidity[i])
-        record = record_columns(campaign.curves[i], segments[i], relative_humidity_percent=own)
         turning = turning_forces(campaign.curves[i], segments[i])
-        record |= {"force": turning.force, "peak": turning.peak}
+        columns = record_columns(campaign.curves[i], segments[i], relative_humidity_percent=own)
+        columns |= {"force": turning.force, "peak": turning.peak, "reading": turning.reading, "error": turning.error}
         chosen = np.concatenate((some, np.full(longest - len(some), some[-1])))
-        records.append({name: x[chosen] if x.ndim else x for name, x in record.items()})
-        reading.append(turning.reading[chosen])
-        error.append(turning.error[chosen])
-    together = Record(**{name: jnp.asarray(np.stack([one[name] for one in records])) for name in records[0]})
-    return Records(together, np.stack(reading), np.stack(error))
+        found.append({name: x[chosen] if x.ndim else x for name, x in columns.items()})
+    together = {name: np.stack([one[name] for one in found]) for name in found[0]}
+    reading, error = together.pop("reading"), together.pop("error")
+    return Record(**{name: jnp.asarray(x) for name, x in together.items()}), reading, error
 
 
 @dataclass(frozen=True)

@@ -74,11 +74,10 @@ class Forms(eqx.Module):
 
     def build(self, theta: Float[Array, " numbers"]) -> tuple[AbstractEffect, ...]:
         """The effects with these numbers, in the order of `names`."""
-        built, place = [], len(self.effects)
-        for k, variant in enumerate(self.effects):
-            further = {n.name: theta[place + i] for i, n in enumerate(variant.nuisances)}
-            built.append(variant.build(theta[k], **further))
-            place += len(variant.nuisances)
+        built = []
+        for variant, (amplitude, *places) in zip(self.effects, self.places, strict=True):
+            further = {n.name: theta[place] for n, place in zip(variant.nuisances, places, strict=True)}
+            built.append(variant.build(theta[amplitude], **further))
         return tuple(built)
 
     def law(self, latent: Latent, theta: Float[Array, " numbers"]) -> MccLaw:
@@ -131,23 +130,21 @@ def residuals(point: Point, tests: Tests, forms: Forms) -> Float[Array, "particl
     return jnp.where(tests.mask, tests.displacement - predicted - point.zero[:, None], 0.0)
 
 
-def linearise(
-    point: Point, tests: Tests, forms: Forms, *, with_numbers: bool = True, with_force: bool = True
-) -> Linear:
+def linearise(point: Point, tests: Tests, forms: Forms, *, with_numbers: bool = True) -> Linear:
     """Linearise all tests, by forward derivatives in as many directions as one particle has numbers.
 
     Nothing that is compiled on the way holds both the law and the formula of an effect (`mcc_jax.law.derivatives`), so
-    this is not to be compiled itself. Derivatives by the numbers, and by force, may be left out.
+    this is not to be compiled itself. Derivatives by the numbers may be left out.
     """
     residual, columns, by_force, by_peak = derivatives(
-        point.latent, point.zero, point.theta, tests, forms, with_numbers, with_force
+        point.latent, point.zero, point.theta, tests, forms, with_numbers
     )
     found = residual, columns, by_force, by_peak, by_force + by_peak
     return Linear(*map(jnp.asarray, found))
 
 
 def derivatives(
-    latent: Any, zero: Any, theta: Any, tests: Tests, forms: Forms, with_numbers: bool = True, with_force: bool = True
+    latent: Any, zero: Any, theta: Any, tests: Tests, forms: Forms, with_numbers: bool = True
 ) -> tuple[Any, Any, Any, Any]:
     """Residual, columns, and derivatives by force and peak as in `Linear`: of NumPy, where nothing is traced."""
     record = tests.record
@@ -155,22 +152,19 @@ def derivatives(
     traced = any(is_traced(x) for x in jax.tree.leaves((latent, zero, theta, tests)))
     xp: Any = jnp if traced else np
     latent, zero, theta, mask = (xp.asarray(x) for x in (latent, zero, theta, tests.mask))
-    (count, points), asked = record.force.shape, 2 * with_force
-    size = (4 + theta.shape[1]) * with_numbers
-    wanted = size + asked
+    (count, points), size = record.force.shape, (4 + theta.shape[1]) * with_numbers
     law = xp.insert(xp.exp(latent), 3, 0.0, axis=1)  # a = 0: the shape is taken in
     # Every number of a particle has a direction of its own; those of the law are logarithms.
-    unit = np.zeros((padded(wanted) if forms.effects else wanted, 4 + theta.shape[1]))
+    unit = np.zeros((padded(size + 2) if forms.effects else size + 2, 4 + theta.shape[1]))
     unit[range(size), range(size)] = 1.0
     d_law = unit[:, None, [0, 1, 2, 0, 3]] * law[None]
     d_theta = np.broadcast_to(unit[:, None, 4:], (len(unit), count, theta.shape[1]))
-    d_force = d_peak = xp.zeros((len(unit), count, points))
-    if with_force:
-        own = xp.where(xp.asarray(tests.reading), 1.0, 0.0)
-        elastic = xp.where(xp.asarray(tests.peak_error) > 0, 1.0, 0.0)
-        # A reading on virgin loading is its own peak; where an estimate replaces readings, both move together.
-        parts = ((own, 1 - own), (1 - elastic, elastic))
-        d_force, d_peak = (xp.concatenate([d_peak[:size], xp.stack(p), d_peak[wanted:]]) for p in parts)
+    own = xp.where(xp.asarray(tests.reading), 1.0, 0.0)
+    elastic = xp.where(xp.asarray(tests.peak_error) > 0, 1.0, 0.0)
+    before, after = xp.zeros((size, count, points)), xp.zeros((len(unit) - size - 2, count, points))
+    # A reading on virgin loading is its own peak; where an estimate replaces readings, both move together.
+    d_force = xp.concatenate([before, xp.stack([own, 1 - own]), after])
+    d_peak = xp.concatenate([before, xp.stack([1 - elastic, elastic]), after])
 
     def of_effects(numbers: Any) -> tuple[Any, ...]:
         return tuple(numbers[..., list(each)] for each in forms.places)
@@ -179,12 +173,11 @@ def derivatives(
     directions = Numbers(d_law, d_force, d_peak, of_effects(d_theta))
     kinds = forms.unloading, StrainScaling.RAW
     value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directions))
-    slopes = xp.where(mask[None], slopes[:wanted], 0.0)
-    residual = zeros = xp.zeros((count, points))
+    slopes = xp.where(mask[None], slopes[: size + 2], 0.0)
+    residual = xp.zeros((count, points))
     if tests.displacement is not None:
         residual = xp.where(mask, xp.asarray(tests.displacement) - value - zero[:, None], 0.0)
-    by_force, by_peak = slopes[size:] if with_force else (zeros, zeros)
-    return residual, xp.moveaxis(slopes[:size], 0, -1), by_force, by_peak
+    return residual, xp.moveaxis(slopes[:size], 0, -1), slopes[size], slopes[size + 1]
 
 
 def snap(latent: Latent, particle: Particle) -> Scalar:

@@ -43,14 +43,12 @@ class Correlation(enum.Enum):
     MATERN_32 = "matern-3/2"
     MATERN_52 = "matern-5/2"
 
-    def kernel(self, length: Scalar, sd: Scalar) -> quasisep.Quasisep:
-        """The covariance function, with a correlation length and a standard deviation."""
-        kinds = {
-            Correlation.EXPONENTIAL: quasisep.Exp,
-            Correlation.MATERN_32: quasisep.Matern32,
-            Correlation.MATERN_52: quasisep.Matern52,
-        }
-        return kinds[self](scale=length, sigma=sd)
+
+KERNELS = {
+    Correlation.EXPONENTIAL: quasisep.Exp,
+    Correlation.MATERN_32: quasisep.Matern32,
+    Correlation.MATERN_52: quasisep.Matern52,
+}
 
 
 class Along(enum.Enum):
@@ -95,8 +93,8 @@ class Noise(eqx.Module):
         return cls(displacement, force, correlated, length, scale)
 
 
+# Variance of a point that does not count [um^2]: beyond any reading, and far from where doubles lose digits.
 MASKED_UM2 = 1e12
-"""Variance of a point that does not count [um^2]: beyond any reading, and far from where doubles lose digits."""
 
 
 class Whitening(eqx.Module):
@@ -219,7 +217,7 @@ def whitening(
     variance = jnp.where(tests.mask, scale**2 * _read_out(noise, tests, linear), MASKED_UM2)
     place = tests.path if along is Along.LOAD else tests.record.time
     with standard_promotion():
-        kernel = correlation.kernel(noise.length, scale * noise.correlated)
+        kernel = KERNELS[correlation](scale=noise.length, sigma=scale * noise.correlated)
         solver = QuasisepSolver(kernel, place, Diagonal(variance), assume_sorted=True)
     error = scale * noise.force * tests.peak_error
     if tests.peak_sd is not None:
@@ -241,8 +239,8 @@ def _read_out(noise: Noise, tests: Tests, linear: Linear) -> Array:
     return variance if tests.reading_weight is None else variance / tests.reading_weight
 
 
+# Degrees of freedom of robust noise (Lange, Little and Taylor 1989): weights fall off from two deviations on.
 FREEDOM = 4.0
-"""Degrees of freedom of robust noise (Lange, Little and Taylor 1989): weights fall off from two deviations on."""
 
 
 @compiled
@@ -322,11 +320,9 @@ def effects_grams(
     return jax.vmap(lambda *test: without_own(noise, *test, zero_sd, correlation, along)[0])(noise.scale, tests, linear)
 
 
-STEP = 1e-3
-"""Step of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size."""
-
-DIFFERENCES = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
-"""What is added to the logarithms for a value and its gradient."""
+# Steps of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size.
+STEP, WIDE_STEP = 1e-3, 0.02
+OUTLYING = 5.0  # a particle whose noise differs by so many standard deviations keeps its own scale; found by trial
 
 
 class NoiseFit(eqx.Module):
@@ -378,7 +374,7 @@ def estimate_noise(
     linear = replace(linear, columns=linear.columns[..., :4], bends=None)
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        at = jnp.asarray(logs + DIFFERENCES)
+        at = jnp.asarray(logs + STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)]))
         each = blocks.all(likelihoods, (start.scale, tests, linear), at, zero_sd, correlation, along)
         # Summed here, in one order, however the particles are spread.
         values = -(np.sum(np.asarray(each), axis=0) + prior.log_density(np.asarray(at)))
@@ -391,21 +387,15 @@ def estimate_noise(
     noise = Noise.of(np.exp(found.x), start.scale)
     if not uncertainty:
         return NoiseFit.unsure(noise, converged=bool(found.success))
-    width = 0.02
-    columns = [
-        (value_and_gradient(found.x + width * e)[1] - value_and_gradient(found.x - width * e)[1]) / (2 * width)
-        for e in np.eye(4)
-    ]
-    if not np.isfinite(columns).all():
+    ends = [[value_and_gradient(found.x + step * e)[1] for e in np.eye(4)] for step in (WIDE_STEP, -WIDE_STEP)]
+    curvature = np.subtract(*ends) / (2 * WIDE_STEP)
+    if not np.isfinite(curvature).all():
         return NoiseFit.unsure(noise, converged=False)
-    values, vectors = np.linalg.eigh((np.array(columns) + np.array(columns).T) / 2)
+    values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
     values = np.maximum(values, 1e-6)
     volume = float(prior.log_density(found.x)) + 2 * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values))
     covariance = jnp.asarray((vectors / values) @ vectors.T)
     return NoiseFit(noise, covariance, jnp.asarray(volume), bool(found.success))
-
-
-OUTLYING = 5.0  # a particle whose noise differs by so many standard deviations keeps its own scale; found by trial
 
 
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:

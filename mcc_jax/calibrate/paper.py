@@ -429,11 +429,11 @@ def predict_particles(
     # Campaigns of similar size and length share one compilation.
     points = [np.arange(len(campaign.curves[i])) for i in kept]
     longest = padded_length(max(map(len, points)))
-    record = records_of(campaign, kept.tolist(), adjustment.segments, points, longest).record
+    record, _, _ = records_of(campaign, kept.tolist(), adjustment.segments, points, longest)
     sizes = particle_batch(campaign.diameters_um[kept])
     C = np.array(own) ** (1 / np.array([1, 3, 5]))
     mean = jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, len(kept))), law)
-    same = eqx.tree_at(lambda one: one.plastic, mean, Plastic(*jnp.asarray(C.T)))
+    same = eqx.tree_at(lambda one: one.plastic, mean, eqx.filter_vmap(Plastic)(*jnp.asarray(C.T)))
     blocks = Blocks(len(kept))
     by_mean, by_own = (np.asarray(blocks.all(responses, (laws, sizes, record))) for laws in (mean, same))
     fits: list[ParticleFit | None] = [None] * len(campaign)

@@ -229,16 +229,10 @@ class Drawer:
     def some(
         self, key: Array, which: np.ndarray, population: Population, candidates: int, *, common: bool = False
     ) -> ParticleDraws:
-        """Some particles. They are few: every process draws all of them."""
-        found = []
-        for i in range(0, len(which), GROUP):
-            group = which[i : i + GROUP]
-            # Padded to one of a few sizes: every size would be compiled again.
-            size = min(self.count, GROUP, 4 ** int(np.ceil(np.log(max(len(group), 2)) / np.log(4))))
-            own = jax.random.fold_in(key, 1000 * i + candidates)
-            few = Drawer(self._exact.some(group), size, self._chunk)
-            found.append(few.all(own, population, candidates, common=common))
-        return ParticleDraws(*(cast(Any, np.concatenate(several, 1)) for several in zip(*found, strict=True)))
+        """Some particles, in blocks of one of a few sizes: every size would be compiled again."""
+        size = min(self.count, GROUP, 4 ** int(np.ceil(np.log(max(len(which), 2)) / np.log(4))))
+        few = Drawer(self._exact.some(which), size, self._chunk)
+        return few.all(jax.random.fold_in(key, candidates), population, candidates, common=common)
 
     def redraw(
         self,
@@ -369,21 +363,13 @@ def evenly(count: int, some: int) -> np.ndarray:
     return np.linspace(0, count - 1, some).astype(int)
 
 
-class Correction(NamedTuple):
-    """What the exact likelihood adds to the log density of the population at every draw, up to a constant.
+def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> tuple[np.ndarray, float]:
+    """What the exact likelihood adds to the log density of the population at every draw, up to a constant, by
+    regression on the population's parameters; and the standard error of its slope, by how many standard deviations of
+    the posterior means would move.
 
-    `error` is the standard error of its slope: by how many standard deviations of the posterior means would move.
-    """
-
-    log_weight: np.ndarray
-    error: float
-
-
-def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> Correction:
-    """Regression of the sum of log ratios on the population's parameters, and its prediction for every draw.
-
-    `total` gives the sums at rows of `draws`, with random numbers that depend on its first argument, 0 or 1; `draws`
-    are those of the parameters, shape (draws, parameters).
+    `total` gives the sums of log ratios at rows of `draws`, with random numbers that depend on its first argument, 0 or
+    1; `draws` are those of the parameters, shape (draws, parameters).
     """
     rows = evenly(len(draws), PROBES)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)
@@ -392,4 +378,4 @@ def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray
     design = np.concatenate([np.ones((len(rows), 1)), white[rows]], 1)
     slopes = np.stack([np.linalg.lstsq(design, total(which, rows), rcond=None)[0][1:] for which in (0, 1)])
     # Two estimates from independent random numbers: half their difference is the standard error of their mean.
-    return Correction(white @ slopes.mean(0), float(np.linalg.norm(slopes[0] - slopes[1]) / 2))
+    return white @ slopes.mean(0), float(np.linalg.norm(slopes[0] - slopes[1]) / 2)

@@ -90,7 +90,6 @@ def test_derivatives_are_finite_differences(law, theta):
     assert np.all(columns[..., 3][mask & (np.asarray(tests.force) < 0.95 * np.asarray(tests.record.peak))])
     # What is not asked for is not there.
     assert linearise(point, tests, law, with_numbers=False).columns.shape == (*mask.shape, 0)
-    assert not np.any(linearise(point, tests, law, with_force=False).by_force)
 
 
 @pytest.mark.extended
