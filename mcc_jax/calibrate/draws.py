@@ -21,7 +21,7 @@ from .marginal import Marginal, ParticleDraw
 from .mode import ACCEPT, Fit, handlers, log_densities, populations, seeded
 from .model import Model, coefficients
 from .noise import standard_promotion
-from .particles import PROBES, Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
+from .particles import ExactLikelihood, Length, are_many, corrected, some_of, weighted
 from .population import COEFFICIENTS, Population
 
 # Of NUTS where importance sampling failed. Around its mode, in coordinates scaled by the curvature there, a density
@@ -41,24 +41,22 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: boo
     Without `fallback`, and where the fit did not converge, NUTS never runs, which takes minutes there: the draws are
     then those of the proposal.
     """
-    count, exact = len(fit.tests), exact_likelihood(fit)
+    exact = exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    few = stride_of(count, length.total) == 1
+    many = are_many(len(fit.tests), length)
     fallback = fallback and bool(np.all(np.asarray(fit.converged)[1:]))
-    run, good, (integral, error) = _sampled(population_key, fit, length, not few, fallback)
-    if few:
-        drawer = Drawer(exact, block, chunk_of(length.total))
-        found = weighted(drawer, run.population, length, check_key, pick_key)
-    else:
-        drawer = Drawer(exact, block, PROBES)
+    run, good, (integral, error) = _sampled(population_key, fit, length, many, fallback)
+    if many:
         parameters = _stack(run.population, fit, length)[1].reshape(length.total, -1)
-        found = corrected(drawer, run.population, parameters, length, check_key, pick_key, particle_key)
-    run = run._replace(population=every(run.population, found.chosen))
+        found = corrected(exact, block, run.population, parameters, length, check_key, pick_key, particle_key)
+    else:
+        found = weighted(exact, block, run.population, length, check_key, pick_key)
+    run = run._replace(population=some_of(run.population, found.chosen))
     value = integral + found.log_ratio[0] + float(fit.noise.log_evidence)
     return _collected(run, found.particles[:4], fit, length, found.keep) | {
         "pareto_k": found.k,
         "pareto_k_joint": found.k_joint if good else np.inf,
-        "weights_applied": few,
+        "weights_applied": not many,
         "log_evidence": (value, float(np.hypot(error, found.log_ratio[1]))),
         "notes": found.notes,
     }

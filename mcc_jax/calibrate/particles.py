@@ -182,19 +182,13 @@ class Length(NamedTuple):
         return self.chains * self.draws
 
 
-def stride_of(count: int, total: int) -> int:
-    """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
-    return max(1, -(-total * count // COMPARED))
+def are_many(count: int, length: Length) -> bool:
+    """Whether there are too many draws of single particles to compare each with the exact likelihood."""
+    return length.total * count > COMPARED
 
 
-def chunk_of(total: int) -> int | None:
-    """Draws of a chunk where all are compared: on a CPU two of them run side by side, on any number of cores."""
-    return -(-total // SIDE_BY_SIDE) if jax.default_backend() == "cpu" else None
-
-
-def every(population: Population, which: int | np.ndarray) -> Population:
-    """Every so-many-th draw, or those at given positions."""
-    rows = slice(None, None, which) if isinstance(which, int) else which
+def some_of(population: Population, rows: slice | np.ndarray) -> Population:
+    """Some draws of the population."""
     return jax.tree.map(lambda x: np.asarray(x)[rows], population)
 
 
@@ -281,8 +275,11 @@ class Drawn(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def weighted(drawer: Drawer, population: Population, length: Length, check_key: Array, pick_key: Array) -> Drawn:
+def weighted(
+    exact: ExactLikelihood, block: int, population: Population, length: Length, check_key: Array, pick_key: Array
+) -> Drawn:
     """Few particles: the weight of a draw is the product of all particles' ratios of exact to quadratic likelihood."""
+    drawer = Drawer(exact, block, -(-length.total // SIDE_BY_SIDE) if jax.default_backend() == "cpu" else None)
     particles = drawer.all(check_key, population)
     ratio = np.asarray(particles.log_ratio)
     k = pareto_k(ratio)
@@ -294,7 +291,8 @@ def weighted(drawer: Drawer, population: Population, length: Length, check_key: 
 
 
 def corrected(
-    drawer: Drawer,
+    exact: ExactLikelihood,
+    block: int,
     population: Population,
     parameters: np.ndarray,
     length: Length,
@@ -307,13 +305,14 @@ def corrected(
     Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
     several candidates; of the others the draws are left as they are.
     """
+    drawer = Drawer(exact, block, PROBES)
     checks = PROBES * max(2, COMPARED // (PROBES * drawer.count))
-    ratio = np.asarray(drawer.all(check_key, every(population, evenly(length.total, checks))).log_ratio)
+    ratio = np.asarray(drawer.all(check_key, some_of(population, evenly(length.total, checks))).log_ratio)
     scatter, k = relative_scatter(ratio), pareto_k(ratio)
     left_out: set[int] = set()
 
     def total(which: int, rows: np.ndarray) -> np.ndarray:
-        probes, own = every(population, rows), jax.random.fold_in(check_key, which)
+        probes, own = some_of(population, rows), jax.random.fold_in(check_key, which)
         ratio = np.maximum(drawer.all(own, probes, common=True).log_ratio, LOWEST)
         # A single candidate may fall off a cliff of the likelihood as the population moves, which says nothing of all.
         if len(changing := np.flatnonzero(np.ptp(ratio, axis=0) > MOST_CHANGE)):
@@ -332,7 +331,7 @@ def corrected(
         notes.append(f"{len(left_out)} particles act on the population through their quadratic summary alone")
     chosen, k_joint = _resampled(log_weight, length)
     keep = max(1, -(-length.total * drawer.count // KEPT))
-    some = every(every(population, chosen), keep)
+    some = some_of(population, chosen[::keep])
     particles = drawer.all(particle_key, some, 0)
     scattering = np.flatnonzero((scatter > SCATTERING_OF_MANY) | (k > MOST_PARETO_K))
     drawer.redraw(pick_key, particles, some, k, scattering, CANDIDATES_OF_MANY)
