@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -150,17 +150,8 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
     and reloading they count from `UNLOADED_FROM` of the peak, below which displacement depends on force with an
-    infinite slope. The approach never counts. Of longer records every n-th row is used, turning points always.
-
-    Args:
-        campaign: the tests.
-        threshold_MPa: stress of the threshold [MPa].
-        most_points: thin records longer than this.
-
-    Raises:
-        InputError: if no particle can be used.
-        InputError: for a threshold that is negative or not finite.
-        RuntimeError: in single precision.
+    infinite slope. The approach never counts. Of records longer than `most_points` every n-th row is used, turning
+    points always. Raises `InputError` if no particle can be used, `RuntimeError` in single precision.
     """
     campaign = check_tests(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
@@ -174,40 +165,37 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
         for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
-    stress = [None if isinstance(one, Finding) else one.stress_max_MPa for one in prepared]
-    strain = [None if isinstance(one, Finding) else one.strain_range for one in prepared]
+    ends = [(None, None) if isinstance(one, Finding) else (one.stress_max_MPa, one.strain_range) for one in prepared]
+    stress, strain = zip(*ends, strict=True)
     prepared = [apart or one for one, apart in zip(prepared, far_apart(stress, strain), strict=True)]
     reasons = tuple(one if isinstance(one, Finding) else None for one in prepared)
-    kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, Finding))
-    if not kept:
+    used = {i: one for i, one in enumerate(prepared) if not isinstance(one, Finding)}
+    if not used:
         raise refusal(campaign, "no particle can be used", reasons)
-    used = [one for one in prepared if not isinstance(one, Finding)]
-    longest = padded_length(max(len(one.rows) for one in used))
+    kept, rows = tuple(used), tuple(one.rows for one in used.values())
+    longest = padded_length(max(map(len, rows)))
 
-    def padded(values: list[np.ndarray], mode: Literal["edge", "constant"] = "constant") -> np.ndarray:
-        return np.stack([np.pad(v, (0, longest - len(v)), mode=mode) for v in values])
+    def padded(values: Iterable[np.ndarray], mode: Literal["edge", "constant"] = "constant") -> Array:
+        return jnp.asarray(np.stack([np.pad(v, (0, longest - len(v)), mode=mode) for v in values]))
 
-    curves = [campaign.curves[i] for i in kept]
-    record, reading, error = records_of(campaign, kept, segments, [one.rows for one in used], longest)
+    record, reading, error = records_of(campaign, kept, segments, rows, longest)
     force = np.asarray(record.force)
     branch = _branches(np.asarray(record.peak), error > 0)
     changes = np.abs(np.diff(force, axis=1, prepend=force[:, :1]))
     tests = Tests(
         particle_batch(campaign.diameters_um[list(kept)]),
         record,
-        jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
-        jnp.asarray(padded([one.mask for one in used])),
-        jnp.asarray(padded([one.loading for one in used])),
-        jnp.asarray([one.contact for one in used]),
+        padded((campaign.curves[i].displacement_um[one.rows].astype(float) for i, one in used.items()), "edge"),
+        padded(one.mask for one in used.values()),
+        padded(one.loading for one in used.values()),
+        jnp.asarray([one.contact for one in used.values()]),
         jnp.asarray(np.cumsum(changes, axis=1) / force.max(axis=1, keepdims=True)),
         jnp.asarray(branch),
         jnp.asarray(reading),
         jnp.asarray(error),
-        *_errors_of_force(curves, used, branch),
+        *_errors_of_force([campaign.curves[i] for i in kept], rows, branch),
     )
-    return Selection(
-        tests, kept, reasons, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
-    )
+    return Selection(tests, kept, reasons, rows, tuple(_notes(campaign, used, most_points)))
 
 
 def compared_rows(selection: Selection) -> dict[int, tuple[np.ndarray, np.ndarray]]:
@@ -218,15 +206,15 @@ def compared_rows(selection: Selection) -> dict[int, tuple[np.ndarray, np.ndarra
 
 
 def _errors_of_force(
-    curves: Sequence[Curve], used: Sequence[_Prepared], branch: np.ndarray
+    curves: Sequence[Curve], rows: Sequence[np.ndarray], branch: np.ndarray
 ) -> tuple[Array | None, Array | None]:
     """Errors of the zeros of force, and of the peaks of branches that were worked out; None where there are none."""
     checked = [c.checked for c in curves]
     zero = np.array([0.0 if one is None else one.force_zero_sd_mN for one in checked])
     peak = np.zeros(branch.shape)
-    for row, (one, of) in enumerate(zip(checked, used, strict=True)):
+    for k, one in enumerate(checked):
         if one is not None:
-            peak[row, : len(of.rows)] = one.force_sd_mN[of.rows]
+            peak[k, : len(rows[k])] = one.force_sd_mN[rows[k]]
     # A branch starts at its peak or one reading behind it.
     peak = np.maximum(*(np.take_along_axis(peak, np.maximum(branch - back, 0), axis=1) for back in (0, 1)))
     return (jnp.asarray(zero) if zero.any() else None), (jnp.asarray(peak) if peak.any() else None)
@@ -359,27 +347,24 @@ def root_mean_squares(tests: Tests, residual: Array | np.ndarray) -> np.ndarray:
     return np.sqrt((np.asarray(residual) ** 2).sum(1) / count)
 
 
-def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):
-    thinned = sum(len(one.rows) < len(campaign.curves[i]) - 1 for i, one in zip(kept, used, strict=True))
-    if any(len(campaign.curves[i]) > most_points for i in kept):
+def _notes(campaign: Campaign, used: Mapping[int, _Prepared], most_points: int) -> Iterator[str]:
+    thinned = sum(len(one.rows) < len(campaign.curves[i]) - 1 for i, one in used.items())
+    if any(len(campaign.curves[i]) > most_points for i in used):
         yield f"{thinned} records were thinned to about {most_points} rows"
-    pairs = zip(kept, used, strict=True)
-    silent = [(campaign.particles[i], one) for i, one in pairs if not (one.mask & ~one.loading).any()]
+    silent = [(repr(campaign.particles[i]), one) for i, one in used.items() if not (one.mask & ~one.loading).any()]
     for hidden, what in ((False, "never unloaded"), (True, "without unloading that can be compared with the law")):
-        names = [repr(name) for name, one in silent if one.unloading_hidden is hidden]
-        more = f", ... ({len(names)} of {len(kept)})" if len(names) > SHOWN else ""
+        names = [name for name, one in silent if one.unloading_hidden is hidden]
+        more = f", ... ({len(names)} of {len(used)})" if len(names) > SHOWN else ""
         if len(names) == 1:
             yield f"particle {names[0]} is {what}: it says nothing about the modulus"
         elif names:
             yield f"particles {', '.join(names[:SHOWN])}{more} are {what}: they say nothing about the modulus"
-    seen: dict[bytes, int] = {}
-    for i in kept:
-        curve = campaign.curves[i]
-        fingerprint = curve.force_mN.tobytes() + curve.displacement_um.tobytes()
-        if fingerprint in seen:
-            first = campaign.particles[seen[fingerprint]]
+    seen: dict[bytes, str] = {}
+    for i in used:
+        curve, name = campaign.curves[i], campaign.particles[i]
+        first = seen.setdefault(curve.force_mN.tobytes() + curve.displacement_um.tobytes(), name)
+        if first != name:
             yield (
-                f"particles {first!r} and {campaign.particles[i]!r} have the same curve to the last digit: "
+                f"particles {first!r} and {name!r} have the same curve to the last digit: "
                 "one test counted twice makes everything look too certain"
             )
-        seen.setdefault(fingerprint, i)

@@ -17,6 +17,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -305,11 +306,16 @@ def likelihoods(
 ) -> Float[Array, "particles many"]:
     """Log likelihood of each test without effects under each of many noises, the particle's numbers integrated out."""
 
-    def one(logs: Array, scale: Scalar, tests: Tests, linear: Linear) -> Scalar:
-        left, factor = without_own(Noise.from_logs(logs, scale), scale, tests, linear, zero_sd, correlation, along)
-        return factor - 0.5 * left[-1, -1]
+    def of_each(logs: Array) -> Array:
+        noise = Noise.from_logs(logs, scale)
 
-    return jax.vmap(lambda *test: jax.vmap(lambda one_noise: one(one_noise, *test))(logs))(scale, tests, linear)
+        def of_one(*test: Any) -> Scalar:
+            left, factor = without_own(noise, *test, zero_sd, correlation, along)
+            return factor - 0.5 * left[-1, -1]
+
+        return jax.vmap(of_one)(scale, tests, linear)
+
+    return jax.vmap(of_each, out_axes=1)(logs)
 
 
 @compiled

@@ -62,6 +62,7 @@ def strain_table(adjustment: Adjustment, diameters_um: np.ndarray, points: int =
     `diameters_um` are D1, D2, D3 [um] of all particles, shape (N, 3). Raises `InputError` if no particle is kept.
     """
     diameters_um = arguments.diameters(diameters_um)
+    points = arguments.whole(points, "points", least=2)
     index = np.flatnonzero(adjustment.kept)
     if not len(index):
         raise InputError("no particle can be used: " + "; ".join(sorted({r for r in adjustment.why_not if r})))

@@ -171,7 +171,6 @@ def random_tests(rng, *, count=1, elastic=AT_THE_END, masked=0.2, zero_sd=None, 
         jnp.asarray(np.broadcast_to(branch, shape)),
         jnp.asarray(rng.random(shape) < 0.8),
         jnp.asarray(np.where(elastic, 0.3 + rng.random(shape), 0.0)),
-        None,
         None if zero_sd is None else jnp.full(count, zero_sd),
         None if peak_sd is None else jnp.asarray(np.where(elastic, peak_sd, 0.0) * np.ones(shape)),
     )
