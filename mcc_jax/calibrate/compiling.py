@@ -7,11 +7,17 @@ import os
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, cast
 
+import jax
 from threadpoolctl import threadpool_limits
 
 from .._numerics import compiled as compiled
+
+MAPS = Path("/proc/self/maps")
+MAX_MAPS = Path("/proc/sys/vm/max_map_count")
+FULL = 0.6  # share of the memory maps a process may have at which compiled functions are forgotten
 
 
 def compiled_quickly[**P, R](function: Callable[P, R]) -> Callable[P, R]:
@@ -51,3 +57,21 @@ def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> li
         return [function(arguments[0])]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(function, arguments))
+
+
+def make_room() -> None:
+    """Forget what JAX has compiled, everybody's, where the process would soon hold more than the system allows.
+
+    Every compiled function holds about three memory maps, a campaign of a new length several hundred functions, and
+    Linux allows a process 65,530 maps: after some thirty campaigns XLA would fail ("LLVM compilation error: Cannot
+    allocate memory") and take the process along. What is needed again is compiled again. Other systems have no such
+    limit, and nothing happens there.
+    """
+    try:
+        with MAPS.open("rb") as lines:
+            used = sum(1 for _ in lines)
+        most = int(MAX_MAPS.read_text())
+    except (OSError, ValueError):
+        return
+    if used > FULL * most:
+        jax.clear_caches()

@@ -12,10 +12,9 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
-from .._memory import make_room
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
-from .compiling import compiled
+from .compiling import compiled, make_room
 from .data import MOST_POINTS, Selection, Tests, point_noise_um, select
 from .forward import Linear, Point, linearise
 from .linearisation import Linearisation
@@ -27,6 +26,7 @@ from .noise import (
     NoiseFit,
     effects_grams,
     estimate_noise,
+    likelihoods,
     particle_scales,
     squared_innovations,
     student_weights,
@@ -203,26 +203,19 @@ class _Fitter:
         """The four numbers of the noise, of very many particles from some of them."""
         self.progress("estimating the noise")
         m, blocks, old = self.model, self.blocks, self.noise.noise
-        given = self.tests, replace(self.linear, bends=None), old.scale
+        # Without what is never read, so that all models share a program.
+        linear = replace(self.linear, columns=self.linear.columns[..., :4], bends=None)
+        given: Any = old.scale, self.tests, linear
         if blocks.number > NOISE_BLOCKS:
             rows = np.linspace(0, len(self.tests) - 1, NOISE_BLOCKS * blocks.size).astype(int)
-            blocks, given = (
-                Blocks(len(rows), blocks.size),
-                jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), given),
-            )
-        tests, linear, scale = given
-        found = estimate_noise(
-            tests,
-            linear,
-            m.zero_prior[1],
-            m.chosen_priors.noise,
-            replace(old, scale=scale),
-            m.correlation,
-            m.along,
-            uncertainty=uncertainty,
-            blocks=blocks,
-        )
-        self.noise = replace(found, noise=replace(found.noise, scale=old.scale))
+            blocks = Blocks(len(rows), blocks.size)
+            given = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), given)
+        shared = m.zero_prior[1], m.correlation, m.along
+
+        def log_likelihoods(logs: Array) -> Array:
+            return blocks.all(likelihoods, given, logs, *shared)
+
+        self.noise = estimate_noise(log_likelihoods, m.chosen_priors.noise, old, uncertainty=uncertainty)
 
     def weigh(self) -> None:
         """New weights of the readings under Student noise."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import enum
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -33,7 +33,6 @@ from .compiling import compiled
 from .data import READING_UM, Tests
 from .forward import Linear
 from .priors import NoisePrior
-from .sharding import Blocks
 from .small_matrices import eliminate
 
 
@@ -358,32 +357,19 @@ class NoiseFit(eqx.Module):
 
 
 def estimate_noise(
-    tests: Tests,
-    linear: Linear,
-    zero_sd: Scalar,
-    prior: NoisePrior,
-    start: Noise,
-    correlation: Correlation,
-    along: Along,
-    *,
-    uncertainty: bool = True,
-    blocks: Blocks,
+    log_likelihoods: Callable[[Array], Array], prior: NoisePrior, start: Noise, *, uncertainty: bool = True
 ) -> NoiseFit:
-    """Noise by restricted maximum likelihood with its prior.
+    """Noise by restricted maximum likelihood with its prior, the particles' scales as they are (`particle_scales`).
 
-    The particles' scales stay as they are in `start` (`particle_scales`). Derivatives with respect to four numbers are
-    cheaper as differences, all of them in one batch, than to compile. The zeros' standard deviation is in um.
+    `log_likelihoods` are those of each particle under many logarithms of the four numbers, shape (particles, many):
+    derivatives are cheaper as differences, all of them in one batch, than to compile.
     """
     from scipy.optimize import minimize
 
-    # Without what is never read, so that all models share a program.
-    linear = replace(linear, columns=linear.columns[..., :4], bends=None)
-
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        at = jnp.asarray(logs + STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)]))
-        each = blocks.all(likelihoods, (start.scale, tests, linear), at, zero_sd, correlation, along)
+        at = logs + STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
         # Summed here, in one order, however the particles are spread.
-        values = -(np.sum(np.asarray(each), axis=0) + prior.log_density(np.asarray(at)))
+        values = -(np.sum(np.asarray(log_likelihoods(jnp.asarray(at))), axis=0) + prior.log_density(at))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No instrument reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.

@@ -23,7 +23,6 @@ from mcc_jax.calibrate.noise import (
     whitening,
 )
 from mcc_jax.calibrate.priors import NoisePrior
-from mcc_jax.calibrate.sharding import Blocks
 
 FOUR = (0.2, 0.3, 0.5, 0.3)
 kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0].value)
@@ -202,8 +201,10 @@ def known_tests(four, scale):
 
 
 def estimate(tests, linear, start, **options):
-    blocks = Blocks(COUNT)
-    return estimate_noise(tests, linear, jnp.asarray(2.0), WEAK, start, *KINDS[0], blocks=blocks, **options)
+    def log_likelihoods(logs):
+        return likelihoods(start.scale, tests, linear, logs, jnp.asarray(2.0), *KINDS[0])
+
+    return estimate_noise(log_likelihoods, WEAK, start, **options)
 
 
 @pytest.fixture(scope="module")

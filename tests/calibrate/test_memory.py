@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from mcc_jax import _memory
-from mcc_jax._memory import make_room
+from mcc_jax.calibrate import compiling
+from mcc_jax.calibrate.compiling import make_room
 
 
 @pytest.fixture
@@ -22,13 +22,13 @@ def traced():
     return function, count
 
 
-@pytest.mark.skipif(not _memory.MAPS.exists(), reason="only Linux limits memory maps, and shows them")
+@pytest.mark.skipif(not compiling.MAPS.exists(), reason="only Linux limits memory maps, and shows them")
 @pytest.mark.parametrize(("limit", "times"), [("10\n", 2), (f"{10**9}\n", 1), ("", 1), ("many", 1)])
 def test_compiled_functions_are_forgotten_near_a_known_limit_only(traced, monkeypatch, tmp_path, limit, times):
     function, count = traced
     file = tmp_path / "max_map_count"
     file.write_text(limit)
-    monkeypatch.setattr(_memory, "MAX_MAPS", file)
+    monkeypatch.setattr(compiling, "MAX_MAPS", file)
     make_room()
     assert function(jnp.ones(3)).tolist() == [2, 2, 2]
     assert len(count) == times
@@ -36,7 +36,7 @@ def test_compiled_functions_are_forgotten_near_a_known_limit_only(traced, monkey
 
 def test_nothing_happens_where_no_maps_are_shown(traced, monkeypatch, tmp_path):
     function, count = traced
-    monkeypatch.setattr(_memory, "MAPS", tmp_path / "none")
+    monkeypatch.setattr(compiling, "MAPS", tmp_path / "none")
     make_room()
     function(jnp.ones(3))
     assert len(count) == 1
