@@ -31,8 +31,6 @@ from .results import JointCalibration
 from .sharding import padded
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
-
-
 SHAPES = (0.0, 2.5)  # values of a that least squares begins from in addition to the population's mode; found by trial
 OPEN = 1e-3  # a combination of shared parameters is open where its curvature, each scaled to its own, is smaller
 
@@ -42,8 +40,8 @@ class Identifiability:
     """What the data say of combinations of the shared parameters.
 
     Attributes:
-        singular_values: of the curvature, every parameter on the scale of its own, largest first; all
-            would be 1 if the parameters did not interact, and 0 marks a combination that the data leave open.
+        singular_values: of the curvature, every parameter on its own scale, largest first; all would be 1 if the
+            parameters did not interact, and 0 marks a combination that the data leave open.
         directions: the combinations, one row each, in the order of `names`.
         names: of the parameters.
     """
@@ -57,12 +55,8 @@ class Identifiability:
     @property
     def open(self) -> list[str]:
         """Combinations that the data leave open, in words."""
-        found = []
-        for value, row in zip(self.singular_values, self.directions, strict=True):
-            if value < OPEN:
-                terms = [f"{w:+.2f} {n}" for w, n in zip(row, self.names, strict=True) if abs(w) > 0.1]
-                found.append(" ".join(terms))
-        return found
+        rows = self.directions[self.singular_values < OPEN]
+        return [" ".join(f"{w:+.2f} {n}" for w, n in zip(row, self.names, strict=True) if abs(w) > 0.1) for row in rows]
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,18 +125,17 @@ class LeastSquares(JointCalibration):
         notes += self._notes_of_the_fit()
         if self._alone:
             notes.append("one particle says nothing of the scatter between particles: no spread is given")
-        elif np.any(np.asarray(self.settings.population.tau) < 1e-3):
-            small = [n for n, t in zip(COEFFICIENTS, np.asarray(self.settings.population.tau), strict=True) if t < 1e-3]
+        elif small := [n for n, t in zip(COEFFICIENTS, self.settings.population.tau, strict=True) if t < 1e-3]:
             notes.append(f"the spread of {', '.join(small)} cannot be distinguished from zero")
         return notes
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
-        values, sds = np.asarray(self.solution.value.shared), self._told_sd
+        a, modulus = ((float(self.solution.value.shared[k]), self._reported_sd[k]) for k in range(2))
         return {
             "converged": self.converged,
-            "a": normal_estimate(values[0], sds[0]),
-            "effective_modulus_MPa": log_estimate(values[1], sds[1]),
+            "a": normal_estimate(*a),
+            "effective_modulus_MPa": log_estimate(*modulus),
         }
 
     @cached_property
@@ -151,9 +144,8 @@ class LeastSquares(JointCalibration):
         tests = self.selection.tests
         point = unpack(self.solution.value, self.settings, tests)
         latent, zero, theta = np.asarray(point.latent), np.asarray(point.zero), np.asarray(point.theta)
-        own, between, shared = (np.asarray(v) for v in self.solution.normal.covariance())
-        values = np.asarray(self.solution.value.shared)
-        sds = self._told_sd
+        own, between, shared = self._covariance
+        values, sds = np.asarray(self.solution.value.shared), self._reported_sd
         flat, eta = np.asarray(tests.flatness), self._shape_factor
         slope = flat / eta
         # Where it is not positive, which the reason says, there is no logarithm, and no coefficient without it.
@@ -224,18 +216,21 @@ class LeastSquares(JointCalibration):
         """eta_p of the particles that took part, shape (N,)."""
         return 1 + float(self.solution.value.shared[0]) * np.asarray(self.selection.tests.flatness)
 
+    @cached_property
+    def _covariance(self) -> tuple[np.ndarray, ...]:
+        """Of each particle's own parameters, between them and the shared ones, and of the shared ones."""
+        return tuple(map(np.asarray, self.solution.normal.covariance()))
+
     @property
     def _shared_sd(self) -> np.ndarray:
         """Standard deviations of the shared parameters."""
-        return np.sqrt(np.diagonal(np.asarray(self.solution.normal.covariance()[2])))
+        return np.sqrt(np.diagonal(self._covariance[2]))
 
     @property
-    def _told_sd(self) -> np.ndarray:
+    def _reported_sd(self) -> np.ndarray:
         """The same; NaN where the data leave a parameter open."""
-        found = self.identifiability
-        rows = found.directions[found.singular_values < OPEN]
-        is_open = (np.sum(rows**2, 0) > 0.1) & bool(found.open)
-        return np.where(is_open, np.nan, self._shared_sd)
+        rows = self.identifiability.directions[self.identifiability.singular_values < OPEN]
+        return np.where(np.sum(rows**2, 0) > 0.1, np.nan, self._shared_sd)
 
     @property
     def _alone(self) -> bool:
@@ -313,7 +308,7 @@ def least_squares(
         progress: called with the name of each step.
 
     Raises:
-        InputError: if no particle can be used; for an argument of the wrong kind or out of its range.
+        InputError: if no particle can be used.
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
@@ -336,8 +331,7 @@ def least_squares(
         starts = [float(population.a), *(a for a in SHAPES if low < a < high)]
         mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
         found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
-        losses = np.array([float(one.loss) for one in found])
-        losses[~np.isfinite(losses)] = np.inf
+        losses = np.nan_to_num([float(one.loss) for one in found], nan=np.inf, posinf=np.inf)
         if np.isinf(losses).all():
             raise beyond_numbers(campaign, selection)
     best = found[int(np.argmin(losses))]

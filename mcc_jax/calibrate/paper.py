@@ -51,6 +51,7 @@ from .paper_steps import (
     master_curve,
     strain_table,
 )
+from .population import COEFFICIENTS
 from .results import Calibration
 from .sharding import Blocks
 
@@ -229,26 +230,22 @@ class PaperCalibration(Calibration):
         """The contents of `calibration.json`."""
         population = self.plastic.population
         eta = np.asarray(eqx.filter_vmap(self.mean_law.shape_factor)(particle_batch(self.campaign.diameters_um)))
-        entries = []
-        for i, name in enumerate(self.campaign.particles):
-            fit = self.particles[i]
-            C1, C3, C5 = fit.plastic if fit else (None, None, None)
-            entries.append(
-                {
-                    "particle": name,
-                    "eta_p": estimate(float(eta[i])),
-                    "C1": estimate(C1),
-                    "C3": estimate(C3),
-                    "C5": estimate(C5),
-                    "zero_um": estimate(fit.zero_um if fit else None),
-                    "rms_um": finite(fit.rms_um) if fit else None,
-                    "own_rms_um": finite(fit.own_rms_um) if fit else None,
-                    "kept": fit is not None,
-                    "why_not": self.adjustment.why_not[i],
-                    "force_zero_mN": force_zero(self.campaign.curves[i]),
-                }
-            )
+        entries = [
+            {
+                "particle": name,
+                "eta_p": estimate(float(eta[i])),
+                **{key: estimate(fit.plastic[j] if fit else None) for j, key in enumerate(COEFFICIENTS)},
+                "zero_um": estimate(fit.zero_um if fit else None),
+                "rms_um": finite(fit.rms_um) if fit else None,
+                "own_rms_um": finite(fit.own_rms_um) if fit else None,
+                "kept": fit is not None,
+                "why_not": self.adjustment.why_not[i],
+                "force_zero_mN": force_zero(self.campaign.curves[i]),
+            }
+            for i, (name, fit) in enumerate(zip(self.campaign.particles, self.particles, strict=True))
+        ]
         reference = self.shape_reference
+        place = None if reference is None else reference.reference
         return {
             "schema": 1,
             "method": "paper",
@@ -260,12 +257,10 @@ class PaperCalibration(Calibration):
             "a_objective": self.objective,
             "a_full": estimate(self.shape.a),
             "a_reference": estimate(reference.a if reference else None),
-            "reference_particle": None
-            if reference is None or reference.reference is None
-            else self.campaign.particles[reference.reference],
+            "reference_particle": None if place is None else self.campaign.particles[place],
             **{
-                f"log_{name}": {"mean": estimate(float(c.mean)), "sd": estimate(float(c.sd))}
-                for name, c in (("C1", population.C1), ("C3", population.C3), ("C5", population.C5))
+                f"log_{name}": {key: estimate(float(getattr(getattr(population, name), key))) for key in ("mean", "sd")}
+                for name in COEFFICIENTS
             },
             "yield_stress_MPa": estimate(float(population.yield_stress)),
             "probability_not_monotone": estimate(float(population.probability_not_monotone)),
@@ -315,9 +310,6 @@ def calibrate_paper(
 
     Raises:
         InputError: if no two particles can be used, or the reference particle is unknown or unusable.
-
-    References:
-        Bommireddy et al. (2018), sections 3 to 6.
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
@@ -391,23 +383,16 @@ def calibrate_paper(
 
 
 def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective, name: str | None) -> ShapeFit | None:
-    index = None
-    if name is not None:
-        if name not in campaign.particles:
-            raise InputError(
-                f"there is no particle {name!r} to serve as reference",
-                file=campaign.source or None,
-                remedy=f"Name one of: {', '.join(campaign.particles)}.",
-            )
-        index = campaign.index(name)
-        if index not in table.index:
-            raise InputError(
-                f"the reference particle {name!r} cannot be used",
-                file=campaign.source or None,
-                remedy="Name another one, or leave the choice to the paper's rule.",
-            )
-    elif len(table.index) < 3 and objective == "full":
+    """`a` by the objective with a reference particle; of two particles only if that was asked for."""
+    if name is None and objective == "full" and len(table.index) < 3:
         return None
+    index = None if name is None else campaign.index(name)
+    if index is not None and index not in table.index:
+        raise InputError(
+            f"the reference particle {name!r} cannot be used",
+            file=campaign.source or None,
+            remedy="Name another one, or leave the choice to the paper's rule.",
+        )
     return fit_shape_parameter(table, "reference", index)
 
 

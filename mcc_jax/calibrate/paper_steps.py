@@ -1,8 +1,4 @@
-r"""The paper's steps: master curve, shape parameter, plastic coefficients and effective modulus.
-
-References:
-    Bommireddy et al. (2018), sections 3 to 6.
-"""
+r"""The steps of Bommireddy et al. (2018), sections 3 to 6, one by one; equations are numbered as there."""
 
 from __future__ import annotations
 
@@ -113,9 +109,9 @@ def master_curve(table: StrainTable, a: float) -> MasterCurve:
 # ---- shape parameter -------------------------------------------------------------------------------------------------
 
 Objective = Literal["full", "reference"]
+# Minima are bracketed by so many values of `a`, up to shape factors far beyond any particle's. No source: a ratio of
+# quadratics changes over steps of 1 over the flatness, 20 times as long.
 GRID, FAR = 2000, 100.0
-"""Minima are bracketed by so many values of `a`, up to shape factors far beyond any particle's. No source: a ratio of
-quadratics changes over steps of 1 over the flatness, 20 times as long."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +149,8 @@ def integration_weights(stress: np.ndarray, reached: np.ndarray) -> np.ndarray:
     return np.where(last, weights / 2, weights)
 
 
+# Of every particle the coefficients of 1, a and a^2 above and below the line, each of shape (3, particles).
 Quadratics = tuple[np.ndarray, np.ndarray]
-"""Of every particle the coefficients of 1, a and a^2 above and below the line, each of shape (3, particles)."""
 
 
 def _square(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -209,11 +205,10 @@ def choose_reference(table: StrainTable) -> int:
 def fit_shape_parameter(table: StrainTable, objective: Objective = "full", reference: int | None = None) -> ShapeFit:
     """Fit `a`, the value under which the particles' curves collapse on one (eqs. 13 to 15).
 
-    A fit that fails is returned with its reason. Raises `InputError` for fewer than two particles, or a reference that
-    was not kept.
+    A fit that fails is returned with its reason.
 
     Args:
-        table: strains on a common grid of stresses.
+        table: strains on a common grid of stresses, of two particles at least.
         objective: "full" (eq. 14) or "reference" (eq. 15, the paper's own simplification).
         reference: position in the campaign of the reference particle; by the paper's rule (`choose_reference`) if None.
     """
@@ -457,11 +452,8 @@ def fit_effective_modulus(
     with the recoverable strain :math:`\delta_b` of the chosen form at the measured peak, and a free zero :math:`o_b`
     per branch, so that neither the loading law nor the contact point enters.
 
-    Args:
-        branches: elastic branches of all particles.
-        shape_factor: eta_p of every particle of the campaign, shape (N,); it enters unless the scaling is raw.
-        unloading: form of the recoverable strain; the modulus belongs to it.
-        strain_scaling: how the shape factor enters.
+    The modulus belongs to the form of unloading. `shape_factor` is eta_p of every particle of the campaign, shape (N,);
+    it enters unless the scaling is raw.
     """
     branches = tuple(branches)
     if not branches:
@@ -506,10 +498,8 @@ _recovery = jax.jit(recovery)
 def collapsed_branches(
     fit: ElasticFit, shape_factor: np.ndarray, unloading: Unloading, strain_scaling: StrainScaling
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Recovered over recoverable strain, and stress over peak stress, of every branch under the fitted modulus [-].
-
-    The zero of each branch is the one that the fit leaves free. Arguments as in `fit_effective_modulus`.
-    """
+    """Recovered over recoverable strain, and stress over peak stress, of every branch under the fitted modulus [-], its
+    free zero taken off."""
     if fit.effective_modulus_MPa is None:
         return []
     power = 1 / 2 if unloading is Unloading.PRINTED else 1
