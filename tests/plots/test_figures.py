@@ -296,7 +296,8 @@ def test_particles_that_were_not_kept_show_the_reason(calibrations):
 def test_a_law_that_misses_the_data_is_said_so(calibrations):
     r = calibrations["two"]
     assert not any("misses" in t for t in texts(plot_particles(r)))
-    bad = tuple(dataclasses.replace(p, rms_um=50.0, own_rms_um=50.0) for p in r.particles)
+    off = (dict.fromkeys(("predicted_um", "own_um"), p.measured_um + 50.0) for p in r.particles)
+    bad = tuple(dataclasses.replace(p, **away) for p, away in zip(r.particles, off, strict=True))
     bad = dataclasses.replace(r, particles=bad)
     (warning,) = [w for w in bad.warnings() if "misses" in w]
     figure = plot_particles(bad)
