@@ -68,15 +68,10 @@ class Evidence:
 
 
 def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, seed: int = 0) -> Evidence:
-    """The log marginal likelihood of a model, by importance sampling around its fit.
+    """The log marginal likelihood of a model, or of a posterior that was sampled.
 
     Population and effects are integrated by importance sampling, particles by Laplace's approximation corrected with
     the exact likelihood, the four parameters of the noise by Laplace's method around their mode.
-
-    Args:
-        campaign: the tests, or a posterior that was sampled.
-        model: what is assumed; of a posterior its own.
-        seed: random seed.
 
     Raises:
         InputError: for a model with robust noise.
@@ -95,10 +90,7 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     `chi2_per_point` (measured less predicted in standard deviations of the noise of the first model), `rms_um`,
     `noise_share`, `converged`.
 
-    Args:
-        campaign: the tests.
-        models: models, or posteriors of this campaign that were sampled.
-        seed: random seed.
+    `models` are models, or posteriors of this campaign that were sampled.
 
     Raises:
         InputError: for no model, one with robust noise, or posteriors whose tests are not the same.
@@ -114,30 +106,24 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     tests = [(one.particles, np.asarray(one.selection.tests.mask).sum(1).tolist()) for one in found]
     if any(one != tests[0] for one in tests):
         raise InputError("the posteriors rest on different tests", remedy="Sample them from the same campaign.")
-    rows, elpds = [], []
-    for one in found:
-        # Draws of the posterior without a particle are those of all, weighted by one over its likelihood.
-        of_particles = one.log_likelihood.reshape(-1, len(one.particles)).T
-        elpds.append(np.array([logsumexp(smoothed(-each)[0] + each) for each in of_particles]))
-        rows.append(
-            {
-                "model": ", ".join(one.model.variants) or "no effects",
-                "log_evidence": one.log_evidence[0],
-                "log_evidence_error": one.log_evidence[1],
-                "elpd": float(elpds[-1].sum()),
-                "elpd_error": float(np.std(elpds[-1]) * np.sqrt(len(elpds[-1]))),
-                "chi2_per_point": _chi2(one, found[0]),
-                "rms_um": float(np.sqrt(np.mean(one.rms_um() ** 2))),
-                "noise_share": one.noise_share,
-                "converged": one.converged,
-            }
-        )
-    best = int(np.argmax([row["elpd"] for row in rows]))
-    for row, elpd in zip(rows, elpds, strict=True):
-        away = elpd - elpds[best]
-        row["elpd_difference"] = float(away.sum())
-        row["elpd_difference_error"] = float(np.std(away) * np.sqrt(len(away)))
-    return pd.DataFrame(rows)
+    # Draws of the posterior without a particle are those of all, weighted by one over its likelihood.
+    of_particles = [one.log_likelihood.reshape(-1, len(one.particles)).T for one in found]
+    elpd = np.array([[logsumexp(smoothed(-each)[0] + each) for each in log] for log in of_particles])
+    difference = elpd - elpd[np.argmax(elpd.sum(1))]
+    columns = {
+        "model": [", ".join(one.model.variants) or "no effects" for one in found],
+        "log_evidence": [one.log_evidence[0] for one in found],
+        "log_evidence_error": [one.log_evidence[1] for one in found],
+        "elpd": elpd.sum(1),
+        "elpd_error": elpd.std(1) * np.sqrt(elpd.shape[1]),
+        "chi2_per_point": [_chi2(one, found[0]) for one in found],
+        "rms_um": [float(np.sqrt(np.mean(one.rms_um() ** 2))) for one in found],
+        "noise_share": [one.noise_share for one in found],
+        "converged": [one.converged for one in found],
+        "elpd_difference": difference.sum(1),
+        "elpd_difference_error": difference.std(1) * np.sqrt(elpd.shape[1]),
+    }
+    return pd.DataFrame(columns)
 
 
 def _refuse_robust(one: Model | Posterior | None) -> None:

@@ -19,7 +19,7 @@ from .data import MOST_POINTS, Selection, Tests, point_noise_um, select
 from .forward import Linear, Point, linearise
 from .linearisation import Linearisation
 from .marginal import Summaries, summarise
-from .mode import Fit, LogPosterior, careful_enough, expect, log_densities, most_probable, population_of
+from .mode import Fit, LogPosterior, careful_enough, expect, log_densities, most_probable
 from .model import Model
 from .noise import (
     Noise,
@@ -363,7 +363,7 @@ def _widths(free: Array, covariance: Array, target: LogPosterior) -> np.ndarray:
     0; of the logarithm of a positive one, up to `WIDEST`."""
     slope = np.asarray(theta_slope(free, target))
     sd = np.sqrt(np.maximum(np.einsum("kd,de,ke->k", slope, np.asarray(covariance), slope), 1e-300))
-    middle = np.abs(np.asarray(population_of(free, target).theta))
+    middle = np.abs(np.asarray(target.population(free).theta))
     width = np.minimum(sd, np.where(middle > 0, 0.5 * middle, np.inf))
     for k, _ in target.marginal.scatter.positive:
         width[k] = min(sd[k] / middle[k], WIDEST)

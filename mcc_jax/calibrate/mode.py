@@ -102,17 +102,13 @@ class LogPosterior(eqx.Module):
             potential: Any = potential_energy(self.model.population, (self.marginal,), {}, self.sites(free))
             return -potential
 
+    @compiled
     def population(self, free: Float[Array, " d"]) -> Population:
         """The population at unbounded coordinates."""
+        prior = self.model.population
         with standard_promotion():
-            prior = seeded(self.model.population)
-            return self.at_values(constrain_fn(prior, (self.marginal,), {}, self.sites(free)))
-
-    def at_values(self, values: dict[str, Array]) -> Population:
-        """The population at values of its sites."""
-        prior = handlers.substitute(self.model.population, data=values)
-        with standard_promotion():
-            return seeded(prior)(self.marginal)
+            values = constrain_fn(seeded(prior), (self.marginal,), {}, self.sites(free))
+            return seeded(handlers.substitute(prior, data=values))(self.marginal)
 
     def sites(self, free: Array) -> dict[str, Array]:
         """Unbounded coordinates by the names of their sites."""
@@ -153,24 +149,13 @@ def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
     at = marginal.laplace(population)
     none = marginal.place(population, jnp.zeros_like(at.deviations))
     varying = jnp.asarray([k for k, _ in marginal.scatter.varying], int)
-    width = jnp.sqrt(jnp.sum(at.placed.jacobian**2, -1))
-    mean, factor = none.latent, none.jacobian[:, :4]
-    # Without the bend of the straightened coordinates, which is that of the point.
-    _, slope = straighten(mean - marginal.point.latent)
-    sd = jnp.sqrt(jnp.sum((factor / slope[..., None]) ** 2, -1))
+    theta_sd = jnp.sqrt(jnp.sum(at.placed.jacobian**2, -1))[:, 4:][:, varying]
+    # Without the curvature of the straightened coordinates, which is that of the point.
+    _, slope = straighten(none.latent - marginal.point.latent)
+    sd = jnp.sqrt(jnp.sum((none.jacobian[:, :4] / slope[..., None]) ** 2, -1))
     zero = marginal.zero + jnp.einsum("np,np->n", marginal.zero_slope, at.placed.u)
-    theta = at.placed.theta
-    return Expected(
-        mean,
-        sd,
-        at.placed.latent,
-        theta,
-        none.theta[:, varying],
-        width[:, 4:][:, varying],
-        zero,
-        at.hessian,
-        at.stretch,
-    )
+    of_population = none.latent, sd, at.placed.latent, at.placed.theta, none.theta[:, varying], theta_sd
+    return Expected(*of_population, zero, at.hessian, at.stretch)
 
 
 def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
@@ -182,12 +167,6 @@ def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
     return sharp if widest < SHARP else target
-
-
-@compiled
-def population_of(free: Float[Array, " d"], target: LogPosterior) -> Population:
-    """The population at unbounded coordinates."""
-    return target.population(free)
 
 
 @compiled
@@ -353,7 +332,7 @@ class Fit(eqx.Module):
     @property
     def population(self) -> Population:
         """The most probable population."""
-        return population_of(self.mode, self.target)
+        return self.target.population(self.mode)
 
     def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
         """NumPyro's NUTS for the model, from the mode on, in coordinates in which the covariance there is the identity.

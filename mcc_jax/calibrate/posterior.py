@@ -150,12 +150,10 @@ class Posterior(JointCalibration):
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
         notes = [*self.failures(), *map(str, self.findings), *self._notes_of_the_fit()]
-        if len(self.particles) < 3:
-            notes.append(
-                f"{len(self.particles)} particles say little about a population: its spread is mostly the prior"
-            )
-        flat = np.asarray(self.selection.tests.flatness)
-        if np.ptp(flat) < 0.02:
+        count = len(self.particles)
+        if count < 3:
+            notes.append(f"{count} particles say little about a population: its spread is mostly the prior")
+        if np.ptp(np.asarray(self.selection.tests.flatness)) < 0.02:
             notes.append("all particles have the same shape, which does not determine a: a is its prior")
         share = float(np.mean(self.probability_not_monotone()))
         if share > 0.05:
@@ -166,14 +164,15 @@ class Posterior(JointCalibration):
         """Share of a new particle's laws that are not monotone, one number per draw of the population."""
         from scipy.special import ndtr
 
-        mu, tau = np.asarray(self.population.mu), np.asarray(self.population.tau)
-        gap = np.log(20 / 9) + mu[..., 0] + 5 * mu[..., 2] - 6 * mu[..., 1]
-        spread = np.sqrt(tau[..., 0] ** 2 + 25 * tau[..., 2] ** 2 + 36 * tau[..., 1] ** 2)
+        powers = np.array([1.0, -6.0, 5.0])  # of C1 C5^5 / C3^6, which is 9/20 where the curve goes flat
+        gap = np.log(20 / 9) + np.asarray(self.population.mu) @ powers
+        spread = np.sqrt(np.asarray(self.population.tau) ** 2 @ powers**2)
         return ndtr(-gap / np.maximum(spread, 1e-12))
 
     def yield_stress_MPa(self) -> np.ndarray:
         r""":math:`\sigma_y = E[C_1]/17.16` [MPa] (eq. 22), one number per draw of the population."""
-        return np.exp(np.asarray(self.population.mu)[..., 0] + np.asarray(self.population.tau)[..., 0] ** 2 / 2) / 17.16
+        mu, tau = np.asarray(self.population.mu), np.asarray(self.population.tau)
+        return np.exp(mu[..., 0] + tau[..., 0] ** 2 / 2) / 17.16
 
     def to_arviz(self, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
         """The posterior as an ArviZ `DataTree`; its `to_netcdf(file)` writes it.

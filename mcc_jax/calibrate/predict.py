@@ -59,11 +59,7 @@ class PredictedCurves:
 @compiled
 def _paths(laws: MccLaw, particle: Particle, force: Array, time: Array) -> Array:
     """Displacement [um] of one particle along a clean path, by each of many laws."""
-
-    def one(law: MccLaw) -> Array:
-        return law.path_load(particle, law.init(particle), force, time)[1]
-
-    return jax.lax.map(one, laws)
+    return jax.lax.map(lambda law: law.path_load(particle, law.init(particle), force, time)[1], laws)
 
 
 @compiled

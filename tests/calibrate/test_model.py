@@ -20,7 +20,7 @@ from scipy.stats import kstest, lognorm, nakagami, norm
 from mcc_jax import InputError, Model, Priors, Programme
 from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
 from mcc_jax.calibrate.forward import Point
-from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, population_of, populations, seeded
+from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, populations, seeded
 from mcc_jax.calibrate.noise import standard_promotion
 from mcc_jax.calibrate.priors import Amplitude, SpreadCoordinate, check_prior_of_a, nuisance_prior, population_sites
 from mcc_jax.effects import LIBRARY, find_variant
@@ -231,7 +231,7 @@ def test_coordinates_and_back(target):
     free = np.random.default_rng(2).standard_normal(len(target.names))
     free[target.signed()] = np.abs(free[target.signed()])
     free = jnp.asarray(free)
-    population = population_of(free, target)
+    population = target.population(free)
     again = target.unconstrain(values_at(free, target))
     np.testing.assert_allclose(again, free, rtol=1e-8, atol=1e-8)
     many = populations(jnp.stack([free, free]), target)

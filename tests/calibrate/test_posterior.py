@@ -75,23 +75,19 @@ def test_residuals_are_as_large_as_the_noise(result, content):
 
 def test_json_keeps_the_contract(result, content):
     keys = "schema method mode converged runtime_s seed law a effective_modulus_MPa log_C1 log_C3 log_C5 noise priors"
-    for key in [*keys.split(), "yield_stress_MPa", "probability_not_monotone", "particles", "warnings", "diagnostics"]:
-        assert key in content, key
-    assert content["schema"] == 1
-    assert content["method"] == "bayes"
+    keys += " yield_stress_MPa probability_not_monotone particles warnings diagnostics"
+    assert set(keys.split()) <= set(content)
+    assert (content["schema"], content["method"], content["modulus_scatter"]) == (1, "bayes", None)
     assert content["law"] == {"unloading": "printed", "strain_scaling": "raw"}
-    assert content["modulus_scatter"] is None
-    estimate = {"value", "sd", "interval_95"}
     for found in (content["a"], content["effective_modulus_MPa"], content["log_C1"]["mean"], content["log_C5"]["sd"]):
-        assert set(found) == estimate
+        assert set(found) == {"value", "sd", "interval_95"}
         low, high = found["interval_95"]
         assert low < found["value"] < high
     assert [p["particle"] for p in content["particles"]] == [str(i + 1) for i in range(20)]
+    names = {"eta_p", "C1", "C3", "C5", "zero_um", "rms_um", "noise_scale", "pareto_k"}
     for particle in content["particles"]:
-        names = {"eta_p", "C1", "C3", "C5", "zero_um", "rms_um", "noise_scale", "pareto_k", "kept", "why_not"}
         assert names <= set(particle)
-        assert particle["kept"] is True
-        assert particle["why_not"] is None
+        assert (particle["kept"], particle["why_not"]) == (True, None)
     diagnostics = content["diagnostics"]
     assert diagnostics["failures"] == []
     assert diagnostics["rhat_max"] == pytest.approx(max(result.rhat.values()))
@@ -109,16 +105,12 @@ def test_numbers_are_those_of_the_draws(result, content):
     assert content["yield_stress_MPa"]["value"] == pytest.approx(expected)
 
 
-def without_time(result):
-    return json.dumps(result.to_json() | {"runtime_s": 0.0})
-
-
 @pytest.mark.extended
 def test_another_seed_gives_nearly_the_same_numbers(result):
     other = sample(paper_campaign(0), seed=1)
-    assert without_time(other) != without_time(result)
     one, two = result.named_population(), other.named_population()
     for name in one:
+        assert not np.array_equal(one[name], two[name]), name
         assert abs(one[name].mean() - two[name].mean()) < 0.15 * one[name].std(), name
         assert one[name].std() == pytest.approx(two[name].std(), rel=0.2), name
 
@@ -179,15 +171,16 @@ def tree(result):
 
 def test_groups_dimensions_and_units(tree):
     groups = "posterior log_likelihood sample_stats prior prior_predictive posterior_predictive"
-    groups += " observed_data constant_data"
-    for group in groups.split():
-        assert group in tree.children, group
-    assert tree["posterior"]["C"].dims == ("chain", "draw", "particle", "coefficient")
-    assert tree["posterior"]["mu"].dims == ("chain", "draw", "coefficient")
-    assert tree["posterior"]["zero_um"].dims == ("chain", "draw", "particle")
-    assert tree["log_likelihood"]["test"].dims == ("chain", "draw", "particle")
-    assert tree["observed_data"]["displacement_um"].dims == ("particle", "point")
-    assert tree["posterior_predictive"]["displacement_um"].dims == ("chain", "draw", "particle", "point")
+    assert set(f"{groups} observed_data constant_data".split()) <= set(tree.children)
+    for group, name, dims in (
+        ("posterior", "C", ("chain", "draw", "particle", "coefficient")),
+        ("posterior", "mu", ("chain", "draw", "coefficient")),
+        ("posterior", "zero_um", ("chain", "draw", "particle")),
+        ("log_likelihood", "test", ("chain", "draw", "particle")),
+        ("observed_data", "displacement_um", ("particle", "point")),
+        ("posterior_predictive", "displacement_um", ("chain", "draw", "particle", "point")),
+    ):
+        assert tree[group][name].dims == dims
     assert list(tree["posterior"]["coefficient"].values) == ["C1", "C3", "C5"]
     assert list(tree["posterior"]["particle"].values) == [str(i + 1) for i in range(20)]
     for group, dataset in tree.children.items():
@@ -303,13 +296,6 @@ def test_resampling_by_extreme_weights(weight):
         assert np.all(chosen == np.argmax(weight))
 
 
-def test_weights_that_are_all_equal_have_no_tail():
-    assert np.all(pareto_k(np.zeros((400, 3))) == 0)
-    weight, k = smoothed_weights(np.zeros(400))
-    np.testing.assert_allclose(weight, 1 / 400)
-    assert k <= 0.7
-
-
 def test_weights_turn_draws_of_one_distribution_into_those_of_another():
     """N(0, 1) weighted into N(1, 1): the mean tells a weight from its reciprocal."""
     x = np.random.default_rng(2).standard_normal(20_000)
@@ -322,24 +308,23 @@ def test_weights_turn_draws_of_one_distribution_into_those_of_another():
     assert x[chosen].std() == pytest.approx(1.0, abs=0.1)
 
 
-def test_weights_whose_tail_is_all_alike_are_not_to_be_relied_on():
-    """A quarter of the draws hold everything, or one does: no tail to fit, no answer to believe."""
-    log_weight = np.random.default_rng(0).normal(size=(4000, 3))
+def test_pareto_k_is_the_index_of_the_upper_tail():
+    rng = np.random.default_rng(1)
+    exponential = rng.standard_exponential((4000, 2))
+    # The exponential of k times an exponential variable is Pareto distributed with index k.
+    np.testing.assert_allclose(pareto_k(exponential * np.array([1.2, 0.3])), [1.2, 0.3], atol=0.3)
+    # A lower tail, weights that nearly vanish, does no harm.
+    assert pareto_k(-1.5 * exponential)[0] < 0.3
+    # Where a quarter of the draws have all weight, or one has, there is no tail to fit, and no answer to believe.
+    log_weight = rng.normal(size=(4000, 3))
     log_weight[:, 1] = np.where(np.arange(4000) < 1000, 0.0, -5.0)
     log_weight[:, 2] = np.where(np.arange(4000) == 7, 0.0, -np.inf)
     k = pareto_k(log_weight)
     assert k[0] < 0.7
     assert np.isinf(k[1:]).all()
-
-
-def test_pareto_k_is_the_index_of_the_upper_tail():
-    rng = np.random.default_rng(1)
-    exponential = rng.standard_exponential((4000, 2))
-    # The exponential of k times an exponential variable is Pareto distributed with index k.
-    k = pareto_k(exponential * np.array([1.2, 0.3]))
-    np.testing.assert_allclose(k, [1.2, 0.3], atol=0.3)
-    # A lower tail, weights that nearly vanish, does no harm.
-    assert pareto_k(-1.5 * exponential)[0] < 0.3
+    # Where all are equal there is none either, and no doubt.
+    assert pareto_k(np.zeros((400, 1))) == [0.0]
+    np.testing.assert_allclose(smoothed_weights(np.zeros(400))[0], 1 / 400)
 
 
 def test_a_draw_that_is_impossible_gets_no_weight_and_does_no_other_harm():

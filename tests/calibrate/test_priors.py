@@ -27,16 +27,13 @@ def test_a_file_changes_what_it_names_and_nothing_else(read):
 
 
 def test_whole_numbers_and_several_tables(read):
+    assert read("# nothing\n") == Priors()
     found = read("[a]\nmean = 2\n[C1]\nmedian = 5\nlog_sd = 0.25\n[tau_C3]\nsd = 1\n")
     assert found.a == NormalPrior(2.0, Priors().a.sd)
     assert LogNormalPrior(5.0, 0.25) == found.C1
     assert found.tau_C3 == NakagamiPrior(1.0, Priors().tau_C3.shape)
     assert found == dataclasses.replace(Priors(), a=found.a, C1=found.C1, tau_C3=found.tau_C3)
     assert isinstance(found.a.mean, float)
-
-
-def test_a_file_without_tables_changes_nothing(read):
-    assert read("# nothing\n") == Priors()
 
 
 @pytest.mark.parametrize("unloading", [Unloading.PUNCH, Unloading.PUNCH_EXACT])
@@ -55,18 +52,14 @@ def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
         ("[a]\nmedian = 1.0\n", ["'a'", "median", "mean, sd"]),
         ("[tau_C1]\nmean = 1.0\n", ["tau_C1", "mean", "sd"]),
         ("[a]\nsd = -0.1\n", ["'a'", "the sd of a prior", "> 0", "-0.1"]),
-        ("[a]\nsd = 0.0\n", ["'a'", "sd", "> 0"]),
         ("[tau_C3]\nshape = 0.6\n", ["tau_C3", "shape", "<= 0.5", "0.6"]),
         ("[tau_C3]\nshape = 0\n", ["tau_C3", "shape", "> 0", "0"]),
-        ("[tau_C3]\nsd = 0\nshape = 0.2\n", ["tau_C3", "sd", "> 0"]),
         ("[C1]\nmedian = -6.0\n", ["C1", "median", "> 0"]),
         ("[C1]\nlog_sd = nan\n", ["C1.log_sd", "finite number", "nan"]),
         ("[a]\nmean = inf\n", ["'a'", "mean", "finite number", "inf"]),
         ('[a]\nmean = "1.4"\n', ["'a'", "mean", "finite number", "1.4"]),
         ("[a]\nsd = true\n", ["a.sd", "finite number", "True"]),
-        ("[a]\nmean = [1.0]\n", ["'a'", "mean", "finite number"]),
         ("a = 1.4\n", ["'a'", "table", "[a]"]),
-        ("changed = 1.0\n", ["changed"]),
         ("[a\nmean = 1.0\n", ["TOML"]),
     ],
 )
@@ -81,13 +74,6 @@ def test_a_mistake_is_told_with_file_and_entry(read, text, words):
 def test_a_missing_file_is_told(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.toml"):
         read_priors(tmp_path / "nowhere.toml")
-
-
-def test_a_file_that_is_no_text_is_told(tmp_path):
-    file = tmp_path / "priors.toml"
-    file.write_bytes(b"[a]\nmean = 1.0 # \xe4\n")
-    with pytest.raises(InputError, match=r"priors\.toml"):
-        read_priors(file)
 
 
 def test_json_holds_every_prior_with_its_numbers():
