@@ -18,7 +18,7 @@ from .data import Tests
 from .estimates import effect_numbers
 from .importance import diagnostics, sample_weighted
 from .marginal import Marginal, ParticleDraw
-from .mode import ACCEPT, Fit, handlers, log_densities, populations, seeded
+from .mode import ACCEPT, Fit, LogPosterior, handlers, log_densities, populations, seeded
 from .model import Model, coefficients
 from .noise import standard_promotion
 from .particles import ExactLikelihood, Length, are_many, corrected, some_of, weighted
@@ -27,6 +27,7 @@ from .population import COEFFICIENTS, Population
 # Of NUTS where importance sampling failed. Around its mode, in coordinates scaled by the curvature there, a density
 # that is near normal takes 15 leapfrog steps a draw; one that needs over 31 would take minutes, and shows in R-hat.
 FALLBACK_ACCEPT, TREE_DEPTH = 0.95, 5
+DEFAULT_DEPTH = 10  # NumPyro's
 
 
 def exact_likelihood(fit: Fit) -> ExactLikelihood:
@@ -89,8 +90,9 @@ def _sampled(key: Array, fit: Fit, length: Length, many: bool, fallback: bool) -
 
 def draw_joint(key: Array, fit: Fit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together by NumPyro's NUTS under the exact likelihood."""
-    position, run = _nuts(key, FitCoordinates(fit), length, ACCEPT, 10)
-    population, *particles = jax.tree.map(np.asarray, _explicit(position, FitCoordinates(fit)))
+    coordinates = FitCoordinates(fit, explicit=True)
+    position, run = _nuts(key, coordinates, length, ACCEPT, DEFAULT_DEPTH)
+    population, *particles = jax.tree.map(np.asarray, _explicit(position, coordinates))
     unweighted = {"pareto_k": np.zeros(len(fit.tests)), "pareto_k_joint": None, "weights_applied": False}
     return _collected(run._replace(population=population), particles, fit, length) | unweighted
 
@@ -98,47 +100,52 @@ def draw_joint(key: Array, fit: Fit, length: Length) -> dict[str, Any]:
 class FitCoordinates(eqx.Module):
     """The model's density in the coordinates of a fit, near standard normal: widths over five powers of ten do not mix.
 
-    Explicit, every particle has its random effects, in the coordinates of its Laplace approximation and under the exact
-    likelihood; else they are integrated out.
+    With `exact`, every particle has its random effects, in the coordinates of its Laplace approximation and under the
+    exact likelihood; else they are integrated out.
     """
 
-    fit: Fit
-    explicit: bool = eqx.field(static=True, default=True)
+    target: LogPosterior
+    mode: Array
+    covariance: Array
+    exact: ExactLikelihood | None
+
+    def __init__(self, fit: Fit, *, explicit: bool) -> None:
+        self.target, self.mode, self.covariance = fit.target, fit.mode, fit.covariance
+        self.exact = exact_likelihood(fit) if explicit else None
 
     @property
     def size(self) -> int:
         """Number of the coordinates."""
-        fit = self.fit
-        return len(fit.names) + self.explicit * len(fit.tests) * (fit.marginal.scatter.size + 1)
+        own = 0 if self.exact is None else len(self.exact.tests) * (self.target.marginal.scatter.size + 1)
+        return len(self.mode) + own
 
     def free(self, position: Array) -> Array:
         """Unbounded coordinates of the population."""
-        return self.fit.mode + jnp.linalg.cholesky(self.fit.covariance) @ position[: len(self.fit.names)]
+        return self.mode + jnp.linalg.cholesky(self.covariance) @ position[: len(self.mode)]
 
     def particles(self, position: Array) -> tuple[Population, ParticleDraw]:
         """Population, and particles under it."""
-        population = self.fit.target.population(self.free(position))
-        own = position[len(self.fit.names) :].reshape(len(self.fit.tests), -1)
-        return population, self.fit.marginal.draw(population, own[:, :-1], own[:, -1])
+        marginal, population = self.target.marginal, self.target.population(self.free(position))
+        own = position[len(self.mode) :].reshape(len(marginal.flatness), -1)
+        return population, marginal.draw(population, own[:, :-1], own[:, -1])
 
     def log_density(self, position: Array) -> Array:
         """Log density, up to a constant."""
-        target = self.fit.target
-        if not self.explicit:
-            return target.log_density(self.free(position))
+        if self.exact is None:
+            return self.target.log_density(self.free(position))
         population, drawn = self.particles(position)
-        each = exact_likelihood(self.fit).log_likelihood(population, drawn) + drawn.log_volume
-        return target.log_prior(self.free(position)) + jnp.sum(each) - 0.5 * jnp.sum(drawn.deviations**2)
+        each = self.exact.log_likelihood(population, drawn) + drawn.log_volume
+        return self.target.log_prior(self.free(position)) + jnp.sum(each) - 0.5 * jnp.sum(drawn.deviations**2)
 
     def numpyro_model(self, tests: Tests, marginal: Marginal | None = None) -> None:
         """The same as a NumPyro model, called as `Model`: every site of the model is a `deterministic`."""
-        target, improper = self.fit.target, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
+        target, improper = self.target, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
         position: Any = numpyro.sample("coordinates", improper)
         with handlers.block():  # the population is evaluated here, and adds no sites of its own
             prior: Any = (seeded(target.model.population), (target.marginal,), {}, target.sites(self.free(position)))
             values = constrain_fn(*prior, return_deterministic=True)
             density = self.log_density(position)
-            if self.explicit:
+            if self.exact is not None:
                 population, drawn = self.particles(position)
                 values |= {"C": coefficients(drawn.latent, population, tests.flatness), "zero_um": drawn.zero}
         numpyro.factor("density", density)
@@ -181,7 +188,7 @@ def _chains(
     def chain(key: Array) -> tuple[Array, Array, Array]:
         kernel = NUTS(potential_fn=potential, target_accept_prob=accept, max_tree_depth=depth)
         start_key, key = jax.random.split(key)
-        start = jax.random.normal(start_key, (coordinates.size,), coordinates.fit.mode.dtype)
+        start = jax.random.normal(start_key, (coordinates.size,), coordinates.mode.dtype)
         state = kernel.init(key, warmup, start, (), {})
 
         def advance(state: Any, _: None) -> tuple[Any, tuple[Array, Array, Array]]:

@@ -349,7 +349,7 @@ class Fit(eqx.Module):
 
         from .draws import FitCoordinates
 
-        coordinates = FitCoordinates(self, explicit)
+        coordinates = FitCoordinates(self, explicit=explicit)
         start = init_to_value(values={"coordinates": jnp.zeros(coordinates.size)})
         model = partial(FitCoordinates.numpyro_model, coordinates)
         return NUTS(model, **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
