@@ -14,7 +14,6 @@ from .. import arguments
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..campaign.findings import worst
-from .arviz import data_tree
 from .compiling import imported_meanwhile, one_blas_thread
 from .data import Selection
 from .draws import draw_fast, draw_joint, named_population
@@ -26,7 +25,7 @@ from .mode import Fit
 from .model import Model
 from .particles import Length
 from .population import COEFFICIENTS, Population
-from .predict import predict_measured
+from .predict import data_tree, predict_measured
 from .results import JointCalibration
 
 if TYPE_CHECKING:

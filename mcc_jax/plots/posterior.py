@@ -15,8 +15,8 @@ from matplotlib.ticker import MaxNLocator
 
 from .._format import with_sd
 from ..calibrate import LeastSquares, Posterior, compare_with_paper
-from ..calibrate.arviz import prior_draws
 from ..calibrate.population import COEFFICIENTS
+from ..calibrate.predict import prior_draws
 from . import style
 from .curves import plot_bands, plot_fits, plot_new_particle, plot_whitened
 
