@@ -17,19 +17,15 @@ pytestmark = pytest.mark.extended
 
 
 @pytest.fixture(scope="module")
-def posteriors(paper_posterior):
+def by_particle(paper_posterior):
     """The paper's particles, drawn twice."""
-    return dict(zip(NAMES, (paper_posterior, sample(paper_campaign(0), seed=1)), strict=True))
+    pair = zip(NAMES, (paper_posterior, sample(paper_campaign(0), seed=1)), strict=True)
+    return {name: one.to_arviz() for name, one in pair}
 
 
 @pytest.fixture(scope="module")
-def by_particle(posteriors):
-    return {name: one.to_arviz() for name, one in posteriors.items()}
-
-
-@pytest.fixture(scope="module")
-def by_reading(posteriors):
-    return posteriors["first"].to_arviz(points=True)
+def by_reading(paper_posterior):
+    return paper_posterior.to_arviz(points=True)
 
 
 def test_summary(by_particle):
@@ -63,10 +59,14 @@ def test_sensitivity_to_the_prior(by_particle):
 @pytest.mark.parametrize("draw", ["plot_forest", "plot_trace", "plot_dist", "plot_rank", "plot_ess", "plot_pair"])
 def test_pictures_of_parameters(by_particle, draw):
     getattr(az, draw)(by_particle["first"], var_names=POPULATION[:3], backend="matplotlib")
-    matplotlib.pyplot.close("all")
 
 
 @pytest.mark.parametrize("draw", ["plot_ppc_dist", "plot_ppc_pit", "plot_loo_pit"])
 def test_pictures_of_predictions(by_reading, draw):
     getattr(az, draw)(by_reading, backend="matplotlib")
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
     matplotlib.pyplot.close("all")

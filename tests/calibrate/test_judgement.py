@@ -52,12 +52,7 @@ def test_the_modulus_holds_the_truth_and_is_as_sharp_as_the_clean_tests_allow(ki
     assert low <= TRUTH_MPA <= high
     assert high - low < 2 * (clean_high - clean_low)
     assert calibrated(kind).converged
-
-
-@pytest.mark.extended
-def test_a_clean_campaign_has_nothing_to_tell():
     assert calibrated("clean").findings == ()
-    assert all(curve.checked is None for curve in calibrated("clean").campaign.curves)
 
 
 @pytest.mark.extended
@@ -122,21 +117,16 @@ def test_one_particle_far_from_all_others_is_named(seed, which, times):
     assert found.level == "warning"
 
 
-def test_a_larger_particle_with_a_larger_residual_is_like_the_others():
+def test_what_is_like_the_others_or_has_none_to_be_unlike(monkeypatch):
     rms, reach = np.full(12, 0.05), np.full(12, 50.0)
-    rms[3] *= 20
-    reach[3] *= 20
-    assert unlike_others(NAMES, rms, reach) is None
-
-
-def test_a_mixture_has_no_outlier_and_few_particles_no_usual_residual(monkeypatch):
-    rms, reach = np.full(12, 0.05), np.full(12, 50.0)
-    rms[:5] *= 20
-    assert unlike_others(NAMES, rms, reach) is None
-    assert unlike_others(NAMES[:4], np.array([0.05, 0.05, 0.05, 5.0]), np.full(4, 50.0)) is None
+    larger = np.where(np.arange(12) == 3, 20.0, 1.0)
+    assert unlike_others(NAMES, rms * larger, reach * larger) is None
+    mixture = np.where(np.arange(12) < 5, 20.0, 1.0)
+    assert unlike_others(NAMES, rms * mixture, reach) is None
+    few = NAMES[:4], np.array([0.05, 0.05, 0.05, 5.0]), np.full(4, 50.0)
+    assert unlike_others(*few) is None
     monkeypatch.setattr(judgement, "LEAST", 4)
-    named = unlike_others(NAMES[:4], np.array([0.05, 0.05, 0.05, 5.0]), np.full(4, 50.0))
-    assert named.particles == ("P3",)
+    assert unlike_others(*few).particles == ("P3",)
 
 
 # ---- the answer without them -----------------------------------------------------------------------------------------
@@ -169,21 +159,18 @@ def test_each_set_of_flagged_particles_is_left_out_once():
     assert judged(campaign, answer(), None, None)[0].sentence.count("without") == 0
 
 
-def test_a_flag_of_most_particles_is_not_answered_without_them():
-    campaign = check_tests(faulty.clipped(clean(), 0.9))
-    (found,) = judged(campaign, answer(), None, lambda some: pytest.fail("nothing would be left"))
+def test_flags_of_most_particles_or_of_very_few_are_not_answered_without_them(monkeypatch):
+    def again(some):
+        pytest.fail("nothing would be left, or it would be too expensive")
+
+    (found,) = judged(check_tests(faulty.clipped(clean(), 0.9)), answer(), None, again)
     assert found.check == "saturation"
-
-
-def test_few_flagged_particles_of_many_are_reported_without_another_calibration(monkeypatch):
     campaign = check_tests(faulty.broken(clean(), only=("2",)))
-    one = 1 / len(campaign)
-    monkeypatch.setattr(judgement, "FEW", 0.99 * one)
+    monkeypatch.setattr(judgement, "FEW", 0.99 / len(campaign))
     (found,) = judged(campaign, answer(), None, lambda some: answer())
     assert "without it" in found.sentence
-    monkeypatch.setattr(judgement, "FEW", 1.01 * one)
-    told = judged(campaign, answer(), None, lambda some: pytest.fail("too dear"))
-    assert [one.check for one in told] == ["breakage"]
+    monkeypatch.setattr(judgement, "FEW", 1.01 / len(campaign))
+    assert [one.check for one in judged(campaign, answer(), None, again)] == ["breakage"]
 
 
 def test_an_answer_that_cannot_be_had_is_said():
@@ -203,14 +190,10 @@ def test_a_modulus_is_unknown_from_half_its_size_in_error_on(value, share):
     if found is not None:
         assert "too little of their unloading" in found.sentence
         assert "Unload" in found.remedy
+    assert unknown_modulus(clean(), answer(value, None)["effective_modulus_MPa"]) is None  # a method without errors
 
 
 @pytest.mark.parametrize("converged", [True, False])
 def test_of_a_fit_that_did_not_converge_no_interval_is_told(converged):
     (found,) = judged(clean(), answer(sd=16_000.0, converged=converged), None, None)
     assert ("between" in found.sentence) is converged
-
-
-def test_a_method_without_errors_leaves_no_modulus_unknown():
-    assert unknown_modulus(clean(), answer(16000.0, None)["effective_modulus_MPa"]) is None
-    assert unknown_modulus(clean(), {"value": None, "sd": None, "interval_95": None}) is None

@@ -240,16 +240,12 @@ def test_draws_are_made_of_their_deviations_and_the_volume_is_that_of_the_map(sc
 
 
 @pytest.mark.extended
-def test_a_draw_beyond_the_range_of_the_map_is_finite_and_counts_for_nothing():
+def test_beyond_the_range_of_the_map_and_of_shape_factors_nothing_is_nan():
     population, marginal = case(PLAIN, 3, scale=0.5)
     drawn = draw(population, marginal, jnp.full((3, 3), -9.0), jnp.zeros(3))
     assert np.all(np.isneginf(np.asarray(drawn.log_volume)))
     assert np.all(np.isfinite(np.asarray(drawn.latent)))
     assert np.all(np.isfinite(np.asarray(drawn.zero)))
-
-
-@pytest.mark.extended
-def test_a_shape_factor_that_vanishes_gives_no_nan():
     population, marginal = case(PLAIN)
     value = np.asarray(likelihood(replace(population, a=jnp.asarray(-1 / 0.45)), marginal))
     assert not np.any(np.isnan(value))
