@@ -38,6 +38,11 @@ def first_few(names: Iterable[str], most: int = 6) -> str:
     return ", ".join(shown[:most]) + (", ..." if len(shown) > most else "")
 
 
+def counted(count: int, what: str) -> str:
+    """So many things: "1 file", "3 files"."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def listed(names: Sequence[str], word: str = "and") -> str:
     """Names in a row, the last after a word."""
     if len(names) < 2:

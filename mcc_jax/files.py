@@ -6,11 +6,8 @@ time: what is larger is refused before it fills the memory.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import stat
-from collections.abc import Iterator
-from io import BufferedReader
 from pathlib import Path
 
 from ._errors import InputError
@@ -22,9 +19,8 @@ POSTERIOR_BYTES = 4 * 2**30  # 4000 draws of 1000 particles with 100 compared po
 UNPACKED_BYTES = 512 * 2**20  # what a zip archive of tests or a workbook unpacks to
 
 
-@contextlib.contextmanager
-def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> Iterator[BufferedReader]:
-    """Open a regular file, to which links may lead, for reading bytes.
+def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> bytes:
+    """The bytes of a regular file, to which links may lead.
 
     Raises `InputError` if there is none, it is no regular file, it cannot be read, or it is larger than `most_bytes`;
     `remedy` is what to do then.
@@ -33,13 +29,9 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
     try:
         found = file.stat()
         if stat.S_ISREG(found.st_mode) and found.st_size <= most_bytes:
-            with file.open("rb") as stream:
-                yield stream
-            return
+            return file.read_bytes()
     except FileNotFoundError:
         raise InputError("there is no such file", file=file, remedy="Check the path") from None
-    except InputError:
-        raise
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be read: {why}", file=file, remedy="Check the permissions and the path") from None
@@ -51,12 +43,6 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
     else:  # a pipe may never answer, a device never end
         problem, remedy = "this is no regular file", "Save what it delivers in a file and give that"
     raise InputError(problem, file=file, remedy=remedy)
-
-
-def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> bytes:
-    """The bytes of a regular file; see `open_regular` for what is refused."""
-    with open_regular(path, most_bytes, remedy) as stream:
-        return stream.read()
 
 
 def _in_words(size: int) -> str:

@@ -236,7 +236,7 @@ def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED
     priors = Priors.default(unloading)
     known = vars(priors)
     changes: dict[str, Any] = {}
-    for name, entry in load_toml_file(file, "a TOML file of priors").items():
+    for name, entry in load_toml_file(file).items():
         if name not in known:
             remedy = f"Known priors: {', '.join(sorted(known))}."
             raise InputError(f"there is no prior {name!r}", file=file, remedy=remedy)

@@ -18,7 +18,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import first_few
 from .._store import results
-from ..files import TABLE_BYTES, open_regular
+from ..files import TABLE_BYTES, read_regular
 from .columns import FORCE, LENGTH, TIME, convert, find_column, missing_column
 from .metadata import format_metadata, parse_metadata, read_settings
 from .schema import CHANNELS, Campaign, Curve
@@ -202,12 +202,9 @@ def file_checksums(folder: str | Path) -> dict[str, str]:
     Raises `InputError` if a file cannot be read.
     """
     path = arguments.file_path(folder, "folder")
-    found = {}
-    for name in (PARTICLES, CURVES, METADATA):
-        if os.path.lexists(path / name):
-            with open_regular(path / name, TABLE_BYTES, "Split the campaign into several folders") as stream:
-                found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return found
+    there = [name for name in (PARTICLES, CURVES, METADATA) if os.path.lexists(path / name)]
+    remedy = "Split the campaign into several folders"
+    return {name: hashlib.sha256(read_regular(path / name, TABLE_BYTES, remedy)).hexdigest() for name in there}
 
 
 def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:

@@ -95,21 +95,13 @@ def typed[T](entries: Mapping[str, Any], kind: type[T], file: Path, write: Mappi
     raise InputError(problem, file=file, column=".".join(key), remedy=remedy)
 
 
-def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
-    """The entries of a TOML file; an empty one has none.
-
-    Raises `InputError` if it cannot be read, is no UTF-8 text, or is not TOML. `what` is what it should be, in words.
-    """
+def load_toml_file(path: str | Path) -> dict[str, Any]:
+    """The entries of a TOML file; `InputError` if it cannot be read, is no UTF-8 text, or is not TOML."""
     file = arguments.file_path(path, "path")
-    try:
-        text = read_settings(file)
-    except InputError as error:
-        raise error.changed(remedy=f"{error.remedy}: {what}") from None
-    return load_toml(text, file)
+    return load_toml(read_settings(file), file)
 
 
 def read_settings(file: Path) -> str:
-    """The text of a TOML file, which may be empty."""
     data = read_regular(file, SETTINGS_BYTES, "Keep settings alone in it; readings belong in a table")
     return decode(data, file, "plain text in UTF-8")
 

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
+from .._format import counted
 from ..files import TABLE_BYTES, read_regular
 from .columns import LARGEST_MAGNITUDE
 
@@ -256,11 +257,6 @@ def filled(cells: Sequence[str]) -> int:
     return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
 
 
-def number_of_cells(count: int) -> str:
-    """The number of cells of a row, in words."""
-    return "1 cell" if count == 1 else f"{count} cells"
-
-
 def make_table(records: Sequence[list[str]], rows: Sequence[int], file: Path, delimiter: str = ",") -> Table:
     """A table from the cells of its records, the header first, and the row in which each begins.
 
@@ -312,7 +308,7 @@ def _fit(cells: list[str], row: int, names: list[str], file: Path, delimiter: st
     column, remedy = None, f"{'Use decimal points and quote' if delimiter == ',' else 'Quote'} text that holds {what}"
     if len(cells) < width:
         count, column, remedy = len(cells), names[len(cells)].strip(), "Fill the cell"
-    problem = f"{number_of_cells(count)} where the header has {width}"
+    problem = f"{counted(count, 'cell')} where the header has {width}"
     raise InputError(problem, file=file, row=row, column=column, remedy=remedy)
 
 

@@ -216,7 +216,7 @@ def read_programme(file: str | Path) -> Programme:
         InputError: naming the file and the entry.
     """
     file = arguments.file_path(file, "file")
-    entries = load_toml_file(file, "a TOML file with the programme")
+    entries = load_toml_file(file)
     known = ("control", "rate", "points", "interval_s", "step")
     where = "the programme"
     try:

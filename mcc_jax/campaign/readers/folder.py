@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._errors import InputError
-from ..._format import first_few
+from ..._format import counted, first_few
 from ..findings import Finding
 from ..schema import Control
 from ..table import read_bytes, same_text
@@ -82,7 +82,7 @@ def read_folder(
             remedy = f"If it is one particle, leave it out with {_leave_out(each[1:])}"
             names = tuple(same_text(file.stem) for file in each)
             findings.append(Finding("duplicates", "warning", sentence, remedy, names))
-    form = f"{_count(files)}, {' and '.join(sorted({tests.format for tests in found.values()}))}"
+    form = f"{counted(len(files), 'file')}, {' and '.join(sorted({tests.format for tests in found.values()}))}"
     whole = Tests({}, form, _control(found), _other(found))
     own = Counter(name for tests in found.values() for name in tests.curves)
     keys: dict[str, tuple[str, ...]] = {}
@@ -125,9 +125,9 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
         below = f"; give one of the folders in it: {_listed(inside)}" if inside else ""
         raise InputError("there is no instrument file in the folder", file=folder, remedy=f"Check the path{below}")
     sentences = {
-        f"{_count(quiet)} ignored because of the name: {_listed(quiet)}": quiet,
-        f"{_count(inside, 'folder')} in it not entered: {_listed(inside)}": inside,
-        f"{_count(skipped)} skipped as asked: {_listed(skipped)}": skipped,
+        f"{counted(len(quiet), 'file')} ignored because of the name: {_listed(quiet)}": quiet,
+        f"{counted(len(inside), 'folder')} in it not entered: {_listed(inside)}": inside,
+        f"{counted(len(skipped), 'file')} skipped as asked: {_listed(skipped)}": skipped,
     }
     return files, [Finding("files", "info", sentence) for sentence, some in sentences.items() if some]
 
@@ -135,10 +135,6 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
 def _fits(entry: Path, pattern: str) -> bool:
     name, stem, wanted = same_text(entry.name), same_text(entry.stem), same_text(pattern)
     return wanted in (name, stem) or fnmatchcase(name, wanted)
-
-
-def _count(files: Sequence[Path], what: str = "file") -> str:
-    return f"1 {what}" if len(files) == 1 else f"{len(files)} {what}s"
 
 
 def _listed(files: Iterable[Path]) -> str:

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from ..._errors import InputError
+from ..._format import counted
 from ..columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
 from ..schema import Curve
 from ..table import (
     APOSTROPHES,
     binary_kind,
     filled,
-    number_of_cells,
     parse_number,
     same_text,
     split,
@@ -44,22 +44,19 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
 
     Raises `InputError` if the file does not hold what the mapping says, or a cell is damaged.
     """
-    reader = _Reader(_Rows(data, file, mapping), file, mapping)
+    reader, name = _Reader(_Rows(data, file, mapping), file, mapping), mapping.file.name
     reader.read()
-    if not reader.samples:
-        if reader.missing:
-            raise reader.wrong("every row has a missing reading", f"Check missing in {mapping.file.name}")
+    if not reader.samples and not reader.missing:
         end = "end" if mapping.end else "skip_footer"
-        remedy = f"Check skip_rows, header_rows and {end} in {mapping.file.name}"
-        raise reader.wrong("there are no rows of data", remedy)
-    for name in reader.missing:
-        if name not in reader.samples:
-            raise reader.wrong(f"every row of the test {name!r} has a missing reading", "Remove the test's rows")
+        raise reader.wrong("there are no rows of data", f"Check skip_rows, header_rows and {end} in {name}")
+    for test in reader.missing:
+        if test not in reader.samples:
+            remedy = f"Check missing in {name}, or remove the test's rows"
+            raise reader.wrong(f"every row has a missing reading in the test {test!r}", remedy)
     reader.refuse_groups()
-    curves = {name: reader.curve(name) for name in reader.samples}
+    curves = {test: reader.curve(test) for test in reader.samples}
     other = {"mapping_provenance": mapping.provenance} if mapping.provenance else {}
-    form = f"mapped by {mapping.file.name}"
-    return Tests(curves, form, mapping.control, other, reader.diameters_um, dict(reader.missing))
+    return Tests(curves, f"mapped by {name}", mapping.control, other, reader.diameters_um, dict(reader.missing))
 
 
 class _Rows:
@@ -83,11 +80,7 @@ class _Rows:
         first, *others = decode_lines(data, mapping.encoding, file)
         self.rows = [first.removeprefix("\ufeff"), *others]
 
-    def __len__(self) -> int:
-        return len(self.rows)
-
     def line(self, i: int) -> str:
-        """A row as one text."""
         row = self.rows[i]
         return row if isinstance(row, str) else "\t".join(row)
 
@@ -103,7 +96,6 @@ class _Rows:
         return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
 
     def cells(self, i: int) -> list[str]:
-        """The cells of a row."""
         row = self.rows[i]
         if not isinstance(row, str):
             return row
@@ -127,6 +119,7 @@ class _Reader:
         self.samples: dict[str, list[tuple[int, int, list[_Reading]]]] = {}
         self.missing: Counter[str] = Counter()
         self.diameters_um: dict[str, list[float] | InputError] = {}
+        self.count = len(rows.rows)
         self.between = False  # whether the next sample begins a test
         self.header_came_again = False
 
@@ -140,7 +133,7 @@ class _Reader:
         rows, mapping = self.rows, self.mapping
         head = self._head()
         i = head + mapping.header_rows
-        self.header = rows.cells(head) if mapping.header_rows and head < len(rows) else None
+        self.header = rows.cells(head) if mapping.header_rows and head < self.count else None
         self.stop = self._stop(i)
         self.where = {name: self._place(source.column, head) for name, source in mapping.sources.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
@@ -200,7 +193,7 @@ class _Reader:
         begin = self.mapping.begin
         if begin is None:
             return self.mapping.skip_rows or 0
-        found = next((i for i in range(len(self.rows)) if self.rows.begins(i, begin)), None)
+        found = next((i for i in range(self.count) if self.rows.begins(i, begin)), None)
         if found is None:
             raise self.wrong(f"no row begins with {begin!r}", f"Correct begin in {self.mapping.file.name}")
         return found
@@ -231,8 +224,8 @@ class _Reader:
     def _stop(self, start: int) -> int:
         """The index behind the last row, without the footer."""
         footer = self.mapping.skip_footer
-        full = [start, *(i for i in range(start, len(self.rows)) if not self.rows.blank(i))]
-        return full[max(-footer, -len(full))] if footer else len(self.rows)
+        full = [start, *(i for i in range(start, self.count) if not self.rows.blank(i))]
+        return full[max(-footer, -len(full))] if footer else self.count
 
     def _begins_again(self, i: int) -> int | None:
         """The index of the row below, if the rows above the first sample, or those like them, come again at a row."""
@@ -291,18 +284,10 @@ class _Reader:
         return texts, numbers
 
     def _is_sample(self, i: int) -> bool:
-        """Whether every reading of a row is a number, or marked as missing."""
         return None not in self._readings(i)
 
     def _number(self, cell: str) -> float:
         return parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
-
-    def _is_number(self, cell: str) -> bool:
-        try:
-            self._number(cell)
-        except ValueError:
-            return False
-        return True
 
     def _fit(self, i: int) -> list[str]:
         """The cells of a row of data, of which those behind the last column are empty."""
@@ -319,10 +304,9 @@ class _Reader:
             remedy = f"Check delimiter and decimal_mark in {name}, and quote text that holds the delimiter"
         else:
             remedy = "Fill the row or delete it; if the file was cut off here, export it again"
-        raise self.wrong(f"{number_of_cells(count)} where {self.width} are expected", remedy, i)
+        raise self.wrong(f"{counted(count, 'cell')} where {self.width} are expected", remedy, i)
 
     def _no_number(self, cells: list[str], which: int, i: int) -> InputError:
-        """The error for the cell of a row that should hold a reading."""
         quantity = self.wanted[which]
         cell = cells[self.where[quantity]]
         try:
@@ -357,7 +341,7 @@ class _Reader:
     def _is_footer(self, i: int) -> bool:
         """Whether a row that begins with text has samples above and, in its test, none below."""
         text = _first(self.rows.cells(i))
-        if not self._has_data or self._is_number(text) or _is_no_reading(text):
+        if not self._has_data or self._reading(text) is not None or _is_no_reading(text):
             return False
         stop = self.stop if self.between else self._end_of_test(i)
         return not any(self._is_sample(j) for j in range(i, stop))
@@ -394,7 +378,7 @@ class _Reader:
         if asked is None:
             return None
         try:
-            found = [self._length(name, start, min(stop, len(self.rows))) for name in asked.names]
+            found = [self._length(name, start, min(stop, self.count)) for name in asked.names]
             triple = found * 3 if len(found) == 1 else found
             check_triple(triple, "the header", self.file)
         except InputError as error:
@@ -410,7 +394,7 @@ class _Reader:
             if rest[:1].isalnum():
                 continue
             words = rest.replace(":", " ").replace("=", " ").split()
-            numbers = [word for word in words if self._is_number(word)]
+            numbers = [word for word in words if self._reading(word) is not None]
             units = [word.strip("[]()") for word in words if word not in numbers]
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"

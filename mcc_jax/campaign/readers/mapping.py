@@ -289,7 +289,7 @@ WRITE = {
 def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     """Read and check a mapping file. Raises `InputError` naming the key that is missing, unknown or wrong."""
     file = Path(path)
-    return typed(load_toml_file(file, "a TOML mapping file") | {"": file}, MappingFile, file, WRITE)
+    return typed(load_toml_file(file) | {"": file}, MappingFile, file, WRITE)
 
 
 def _is_encoding(name: str) -> bool:

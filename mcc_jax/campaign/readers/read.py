@@ -9,6 +9,7 @@ from typing import Any
 
 from ... import arguments
 from ..._errors import InputError
+from ..._format import counted
 from ..findings import Finding
 from ..schema import CHANNELS, Campaign, Metadata
 from ..table import binary_kind, read_bytes
@@ -84,12 +85,12 @@ def read_instrument_file(
         origin = f"{place.name}, {tests.format}"
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
     if dropped := sum(tests.missing.values()):
-        rows = "1 row with a missing reading was" if dropped == 1 else f"{dropped} rows with a missing reading were"
-        where = "1 test" if len(tests.missing) == 1 else f"{len(tests.missing)} tests"
-        findings.append(Finding("missing readings", "info", f"{rows} dropped, in {where}", "", tuple(tests.missing)))
+        rows = f"{counted(dropped, 'row')} with a missing reading {'was' if dropped == 1 else 'were'} dropped"
+        sentence = f"{rows}, in {counted(len(tests.missing), 'test')}"
+        findings.append(Finding("missing readings", "info", sentence, "", tuple(tests.missing)))
     provenance = "; ".join([f"{origin}, read by mcc_jax", *(finding.sentence for finding in findings)])
     if unused:
-        rows = "1 row of the diameters is" if unused == 1 else f"{unused} rows of the diameters are"
+        rows = f"{counted(unused, 'row')} of the diameters {'is' if unused == 1 else 'are'}"
         findings.append(Finding("diameters", "info", f"{rows} for no test here and not used"))
     other = dict(tests.other)
     if findings:

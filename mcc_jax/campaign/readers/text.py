@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..._errors import InputError
+from ..._format import counted
 from ..schema import Control, Curve
-from ..table import Table, check_header, number_of_cells
+from ..table import Table, check_header
 from ..validate import fault_of
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
@@ -63,7 +64,7 @@ def number_block(
     records = [lines[i].rstrip("\t ").split("\t") for i in at]
     for i, cells in zip(at, records, strict=True):
         if len(cells) != len(names):
-            problem = f"{number_of_cells(len(cells))} where {len(names)} are expected ({', '.join(names)})"
+            problem = f"{counted(len(cells), 'cell')} where {len(names)} are expected ({', '.join(names)})"
             raise cut_off(problem, file, i + 1)
     columns = list(zip(*records, strict=True)) or [()] * len(names)
     table = Table(file, tuple(names), columns, [i + 1 for i in at], "\t")
