@@ -102,6 +102,7 @@ def load_toml_file(path: str | Path) -> dict[str, Any]:
 
 
 def read_settings(file: Path) -> str:
+    """The text of a TOML file, which may be empty."""
     data = read_regular(file, SETTINGS_BYTES, "Keep settings alone in it; readings belong in a table")
     return decode(data, file, "plain text in UTF-8")
 

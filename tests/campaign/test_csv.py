@@ -227,7 +227,7 @@ def test_bad_folders(tmp_path):
 def test_unreadable_file(tmp_path, monkeypatch):
     folder = make(tmp_path / "c")
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "open", refuse)
