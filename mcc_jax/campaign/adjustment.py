@@ -20,15 +20,13 @@ from .validate import check_campaign
 
 THRESHOLD_MPA = 0.2
 """Stress below which surface irregularities, not the particle, deform [MPa] (Bommireddy et al. 2018, section 3)."""
+# Where the first displacement of a record without approach may lie, in shares of its range, for the test machine's
+# zero to be the contact. Below, the platens would touch long before they meet; above, the test begins compressed.
 MACHINE_ZERO = (-0.25, 1.0)
-"""Where the first displacement of a record without approach may lie, in shares of the range of displacement, for the
-test machine's zero to be the contact. Below, the platens would touch long before they meet; above, the test would have
-begun after more compression than it then shows. Beyond, the first reading is the contact."""
 LEAST_LEVELS = 2  # a loading curve of fewer points above the threshold has no course there
 FEW_FORCES = 5  # a record with no more different forces shows steps of its read-out, not a curve of three coefficients
+# factor in stress and strain within which tests on one material end: the paper's end between 7 and 16 MPa
 FAR_APART = 100.0
-"""Tests on one material end within this factor of each other in stress and in strain: the paper's end between 7 and 16
-MPa, and of the 801 stresses at which its method compares them a test so far below would see eight."""
 SHOWN = 3  # particles that an error names with their reasons, at most
 
 

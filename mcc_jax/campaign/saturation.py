@@ -25,17 +25,14 @@ from .signal import Line, point_noise, quantile, runs
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
 COARSE = 3.0  # and this many times as many as the channel repeats elsewhere: a coarse read-out repeats every value
 STEPS = 2.0  # of its read-out that the channel itself would have gone on by, at least, at its pace before
+# share of its pace before that the other channel keeps up, unless it turns: in a hold it stands still or creeps
 GOES_ON = 0.5
-"""Share of its pace before that the other channel keeps up to where it comes farthest, at least: in a hold it stands
-still, or creeps. One that comes farther and then back while the readings repeat has passed a turning point: in a hold
-it would not, so there its pace does not matter."""
 BEFORE = 12  # readings that give the pace: fewer do not, more reach into another part of the ramp
 ERRORS = 3.0  # standard deviations by which it must come farther; without any advance one stretch in 1000 does
 NEAR_END = 3.0  # standard deviations below the end within which only low readings are left; one in 700 lies beyond
 FITTED_FROM = 0.25  # of the end of the range: below, asperities deform, not the particle
+# share of the range by which a turn may lie beyond it: intervals of the modulus hold the truth up to there
 TRUSTED = 0.25
-"""Share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped at 98, 95, 90
-and 85 % the intervals of the modulus hold the truth; farther on nobody has looked."""
 
 FORCE_RANGE = Finding(
     "saturation",

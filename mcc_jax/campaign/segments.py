@@ -22,9 +22,7 @@ from .schema import CHANNELS, Control, Curve, remembered
 from .signal import branch_envelope, median, noise_level, steady_clock, stretches, turning_points, two_lines
 
 CONTACT = 0.01  # share of the range of force up to which the beginning may count as approach
-BEGINS_LOADED = 0.05
-"""Share of the range of force from which on a record that begins by unloading begins under load: less is the dip by
-which adhesion pulls the platens together."""
+BEGINS_LOADED = 0.05  # share of the range of force from which a record begins under load; less is the dip of adhesion
 SMALLEST_TURN = 0.005  # least depth of a turn, as a share of the signal's range
 TURN_NOISE = 8.0  # the same in standard deviations of the noise
 BAND = 0.0025  # height that a ramp must pass to be none of a hold, as a share of the range; or four deviations

@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+# samples between turns from which on third differences give the noise: at most a quarter straddle a turn
 LONG_BRANCH = 16
-"""Samples between turning points from which on third differences give the noise: no more than a quarter of them
-straddle a turning point there, which shifts their median by less than half."""
 DEEP_TURN = 0.1  # share of the range that noise does not reach, for a first look at how quickly a signal turns
 MANY_TURNS = 8  # more turning points make a signal one of quick cycles
 SPREAD_OF_PEAKS = 1.5  # the extremes of white noise scatter by about two thirds of its standard deviation

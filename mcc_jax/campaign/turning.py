@@ -16,9 +16,8 @@ from .schema import Curve
 from .segments import Segment
 from .signal import Line, median, noise_level
 
+# of the peak force within which readings on both sides give the turning point: bent ramps are parabolas there
 SHARE = 0.1
-"""Share of the peak force within which readings on both sides give the turning point. A ramp under displacement control
-is bent; over so short a part of it a parabola follows it to less than the noise."""
 MOST = 41  # readings on each side at most; more say nothing new against the bend
 CURVED = 9  # readings from which on a parabola is drawn through them, not a straight line
 LEAST = 4  # fewer readings draw no line: the reading itself is taken
@@ -27,10 +26,9 @@ INSIDE = 3.0  # robust standard deviations from its median within which readings
 FITS = 2.0  # times the noise that readings may scatter about a line; else fewer of them, nearer the turn, are taken
 RESOLVED = 1e-6  # noise below this share of the peak is none: the reading itself is exact
 APART = 6.0  # standard deviations; an estimate further from the reading is refused
+# Deviations by which a reading near the turn misses the lines that meet there if the tip is rounded (a sharp one in
+# 0.2 % of the cases): the largest reading is nearer to it then. Rounding within half a reading cannot be seen.
 ROUNDED = 3.5
-"""Where one of the five readings at a turning point misses the lines that meet there by so many standard deviations,
-the tip is rounded, and the largest reading is nearer to it than the meeting point. A sharp tip is taken for one in
-0.2 % of the cases. Rounding within half a reading cannot be seen."""
 
 
 class TurningForces(NamedTuple):

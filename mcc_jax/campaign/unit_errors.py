@@ -20,20 +20,14 @@ import numpy as np
 
 from .signal import median
 
-CONTACT = 0.005
-"""Share of the peak force at which contact counts as made. Low, because soft particles deform much under little force:
-cellulose takes a quarter of its displacement below 3 % of its force."""
+CONTACT = 0.005  # share of the peak force that is contact: cellulose takes a quarter of its displacement below 3 %
 CONTACT_NOISE = 4.0  # the same in standard deviations of the force's noise, where that is more
+# times the force of contact that no reading before contact reaches; a first cycle below it is taken for approach
 LOADED = 4.0
-"""Multiple of the force at which contact counts as made that no reading before contact reaches. Unloadings after it are
-part of the test; a first cycle below it, 2 % of the peak, is taken for part of the approach."""
+# shares of the peak force: below, plastic unloading bends (Oliver and Pharr 1992); above, it creeps
 UNLOADING = (0.9, 0.5)
-"""Shares of the peak force between which unloading is taken as a line: below, the unloading of a plastic contact bends
-(Oliver and Pharr 1992); above, it still creeps."""
 LEAST_RETREAT = 0.2  # share of the displacement that must be given back for the lost work to count
-CORRELATION = 0.6
-"""Least correlation of force and displacement from contact to peak, over forces not reached before: without a particle
-it is less, in loading of any material more than 0.8."""
+CORRELATION = 0.6  # of force and displacement up to the peak, at least: loading of any material has more than 0.8
 MOST_SAMPLES = 4000  # longer records are thinned: enough for features of a curve's size
 
 
@@ -173,17 +167,16 @@ SOLIDS = (
     # 10 % of elongation (Ashby, strength against ductility).
     Properties((5e3, 7e5), (3e2, 7e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 2e4)),
 )
+# prior log odds of the classes: metals are rarer between platens, one in eight by assumption
 WEIGHTS = (0.0, 0.0, -2.0, -2.0)
-"""Prior log odds of these classes. Metals between platens are rarer than the cellulose and the ceramics for which law
-and test machines are made, one in eight by assumption."""
 DIAMETER_UM = (3.0, 2e4)  # what test machines for single particles take between their platens
 FORCE_MN = (1e-3, 1e8)  # peaks, from a nanoindenter's least to a universal test machine's largest (100 kN)
 DISPLACEMENT_UM = (0.01, 1e4)  # at the peak; below 10 nm nobody resolves a curve
 ELONGATION = (1.0, 10.0)  # largest over smallest diameter of a body that stands on its own
 CLOSURE = (1e-6, 0.9)  # displacement over D3: at 1 the platens would touch; the paper's particles reach 0.5 to 0.9
+# Area below the loading curve over its box: of a sphere 0.4 elastically and 0.5 fully plastically; settling adds some
+# (most of 229 pebbles have 0.3 to 0.55), and swapped columns give what is missing to 1.
 FULLNESS = (0.05, 0.53)
-"""Area below the loading curve as a share of its box: of a sphere 0.4 elastically and 0.5 fully plastically; settling
-adds some (most of 229 pebbles have 0.3 to 0.55), and swapped columns give what is missing to 1."""
 LOSS = (-0.03, 1.1)  # share of the work not given back; negative only where columns are swapped, or by drift
 LOADING_S = (0.01, 1.4e4)  # from a tenth to nine tenths of the peak: pebbles are crushed in 0.3 s, few tests take hours
 INTERVAL_S = (1e-6, 30.0)  # between samples: from 1 MHz to two readings a minute
