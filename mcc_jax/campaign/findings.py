@@ -63,8 +63,9 @@ class Finding:
 
 def worst(findings: Iterable[Finding]) -> Level | None:
     """The most serious level among findings, None where there are none."""
-    order: tuple[Level, ...] = ("info", "warning", "error")
-    return max((one.level for one in findings), key=order.index, default=None)
+    levels = {one.level for one in findings}
+    order: tuple[Level, ...] = ("error", "warning", "info")
+    return next((level for level in order if level in levels), None)
 
 
 def named(names: tuple[str, ...], of: int, most: int = 5) -> str:

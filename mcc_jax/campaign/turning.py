@@ -123,7 +123,7 @@ def _level(
     early = time[both] < turn + _meeting(rising, falling, step)
     parts = [_fitted(time, raw, both[side], turn, noise) for side in (early, ~early)]
     if parts[0] is not None and parts[1] is not None:
-        rising, falling = parts
+        rising, falling = parts[0], parts[1]
     meet = _meeting(rising, falling, step)
     (one, first), (other, second) = rising.at(meet), falling.at(meet)
     steep, down = (float(ramp.course.deriv()(meet)) for ramp in (rising, falling))

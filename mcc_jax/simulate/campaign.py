@@ -57,12 +57,12 @@ class HiddenEffect:
 
     def __post_init__(self) -> None:
         variant = self.variant
-        physical: dict[str, float] = {1: {"least": 0.0}, -1: {"most": 0.0}, 0: {}}[variant.sign]
+        physical: Any = {1: {"least": 0.0}, -1: {"most": 0.0}, 0: {}}[variant.sign]
         arguments.number(self.strength, f"{variant.label}: {variant.parameter}", **physical)
         variant.check_names(self.nuisance)
         for one in variant.nuisances:
-            bound = {"above": 0.0} if one.plausible[0] > 0 else {}
-            arguments.number(self.numbers[one.name], f"{variant.label}: {one.name}", **bound)
+            above = 0.0 if one.plausible[0] > 0 else -np.inf
+            arguments.number(self.numbers[one.name], f"{variant.label}: {one.name}", above=above)
 
     def __repr__(self) -> str:
         named = ", ".join(f"{name} {number(value)}" for name, value in self.numbers.items())

@@ -46,12 +46,8 @@ def press(diameters, modulus_MPa, hardness_MPa, strain, *, unloads=True, seconds
 
 
 def noisy(curve, rng, share=1e-3):
-    time_s, force, way = curve
-    return (
-        time_s,
-        force + share * force.max() * rng.standard_normal(len(force)),
-        way + share * way.max() * rng.standard_normal(len(way)),
-    )
+    time_s, *channels = curve
+    return time_s, *(x + share * x.max() * rng.standard_normal(len(x)) for x in channels)
 
 
 def cellulose(seed=0, count=20, *, unloads=True, stress_MPa=(7.0, 16.0), retreat=0.06):
@@ -93,52 +89,38 @@ def ceramic(seed=0, count=12, *, unloads=True, modulus_MPa=1e5, force_mN=(1e4, 1
 
 
 def slip(
-    tests, *, force=1.0, displacement=1.0, seconds=1.0, diameters=(1.0, 1.0, 1.0), swap=False, order=(0, 1, 2), row=None
+    tests, *, force=1.0, displacement=1.0, seconds=1.0, diameters=(1, 1, 1), swap=False, order=(0, 1, 2), row=None
 ):
     """The campaign with a mistake, in all rows or in one."""
     curves, sizes = list(tests.curves), tests.diameters_um.copy()
-    for i, curve in enumerate(tests.curves):
-        if row is not None and i != row:
-            continue
+    for i in range(len(tests)) if row is None else [row]:
+        curve = curves[i]
         F, way = force * curve.force_mN, displacement * curve.displacement_um
         curves[i] = Curve(seconds * curve.time_s, *((way, F) if swap else (F, way)))
         sizes[i] = (sizes[i] * diameters)[list(order)]
     return replace(tests, curves=tuple(curves), diameters_um=sizes)
 
 
-SLIPS = {
-    "uN as mN": ({"force": 1e3}, "The forces seem 1000 times too large, as uN taken for mN", "force_uN"),
-    "N as mN": ({"force": 1e-3}, "The forces seem 1000 times too small, as N taken for mN", "force_N"),
-    "nm as um": (
-        {"displacement": 1e3},
-        "The displacements seem 1000 times too large, as nm taken for um",
-        "displacement_nm",
-    ),
-    "mm as um": (
-        {"displacement": 1e-3},
-        "The displacements seem 1000 times too small, as mm taken for um",
-        "displacement_mm",
-    ),
-    "diameters in mm": ({"diameters": (1e-3,) * 3}, "The diameters seem 1000 times too small", "D1_mm, D2_mm, D3_mm"),
-    "diameters in nm": ({"diameters": (1e3,) * 3}, "The diameters seem 1000 times too large", "D1_nm, D2_nm, D3_nm"),
+FORCES, DISPLACEMENTS, DIAMETERS = (
+    f"The {what} seem 1000 times too" for what in ("forces", "displacements", "diameters")
+)
+SLIPS = {  # what goes wrong, the beginning of the sentence, what the remedy names
+    "uN as mN": ({"force": 1e3}, f"{FORCES} large, as uN taken for mN", "force_uN"),
+    "N as mN": ({"force": 1e-3}, f"{FORCES} small, as N taken for mN", "force_N"),
+    "nm as um": ({"displacement": 1e3}, f"{DISPLACEMENTS} large, as nm taken for um", "displacement_nm"),
+    "mm as um": ({"displacement": 1e-3}, f"{DISPLACEMENTS} small, as mm taken for um", "displacement_mm"),
+    "diameters in mm": ({"diameters": (1e-3,) * 3}, f"{DIAMETERS} small", "D1_mm, D2_mm, D3_mm"),
+    "diameters in nm": ({"diameters": (1e3,) * 3}, f"{DIAMETERS} large", "D1_nm, D2_nm, D3_nm"),
     "D3 in mm": ({"diameters": (1, 1, 1e-3)}, "The diameters D3 seem 1000 times too small", "D3_mm"),
     "N and mm": (
         {"force": 1e-3, "displacement": 1e-3, "diameters": (1e-3,) * 3},
-        "The forces seem 1000 times too small.*displacements.*diameters",
+        f"{FORCES} small.*displacements.*diameters",
         "force_N.*displacement_mm.*D1_mm",
     ),
     "swapped": ({"swap": True}, "Force and displacement seem to be swapped", "Exchange"),
-    "forces negated": ({"force": -1}, "The forces of all tests seem to have the wrong sign", "sign = -1 for force"),
-    "displacements negated": (
-        {"displacement": -1},
-        "The displacements of all tests .* wrong sign",
-        "-1 for displacement",
-    ),
-    "both negated": (
-        {"force": -1, "displacement": -1},
-        "The forces and displacements of .* wrong sign",
-        "force and disp",
-    ),
+    "forces negated": ({"force": -1}, "The forces of all tests .* wrong sign", "sign = -1 for force"),
+    "displacements negated": ({"displacement": -1}, "The displacements of all tests .* wrong sign", "-1 for displacem"),
+    "both negated": ({"force": -1, "displacement": -1}, "The forces and displacements of .* wrong", "force and disp"),
     "times in ms": ({"seconds": 1e3}, "The times seem 1000 times too large, as ms taken for s", "time_ms"),
 }
 EACH_SLIP = pytest.mark.parametrize("kind", SLIPS)
@@ -246,7 +228,7 @@ def test_some_tests_of_another_instrument_are_listed():
     assert finding.particles == good.particles[:8]
 
 
-def test_sign_and_unit_are_both_said():
+def test_sign_and_unit_are_both_reported():
     first, second = check_plausibility(slip(ceramic(), force=-1e3))
     assert "wrong sign" in first.sentence
     assert "1000 times too large" in second.sentence
@@ -264,7 +246,7 @@ ACCUSES = re.compile(r"\bunits?\b|seem|slip|radi|swap|wrong|too (large|small)|[m
 
 @pytest.mark.parametrize("modulus", [1.6e10, 1e-3, 0.0, -5.0, np.nan, np.inf])
 @pytest.mark.parametrize("name", ["cellulose", "ceramic", "ceramic, loading only"])
-def test_a_fitted_modulus_of_no_solid_is_said_and_accuses_no_unit(name, modulus):
+def test_a_fitted_modulus_of_no_solid_is_reported_and_accuses_no_unit(name, modulus):
     """A wrong unit moves it as it moves the stiffness of the record itself, so it is the fitted law that is wrong."""
     tests = made(name, 0)
     bad = [f for f in check_plausibility(tests, modulus_MPa=modulus) if f.level != "info"]

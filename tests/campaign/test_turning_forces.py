@@ -1,4 +1,4 @@
-"""Forces at which branches begin: exact where readings are, unbiased and as certain as told where they are noisy."""
+"""Forces at which branches begin: exact where readings are, unbiased and as certain as stated where they are noisy."""
 
 from itertools import pairwise
 
@@ -69,7 +69,7 @@ def test_of_a_clean_record_the_reading_is_the_level(name, points, slower, bend):
 @pytest.mark.parametrize(("bend", "points"), [(0.0, 400), (0.3, 1200)], ids=["straight", "bent"])
 @pytest.mark.parametrize("on_reading", [True, False], ids=["on a reading", "between readings"])
 @pytest.mark.parametrize("name", ["ramp", "reloads with holds", "hold", "reloads"])
-def test_noisy_levels_are_unbiased_and_as_certain_as_told(name, bend, points, on_reading):
+def test_noisy_levels_are_unbiased_and_as_certain_as_stated(name, bend, points, on_reading):
     """Bias of a twentieth of a reading's deviation is let pass; the largest reading is out by one or two."""
     time, force = drive(*PATHS[name], bend=bend, on_reading=on_reading, points=points)
     rng = np.random.default_rng(3)
@@ -120,7 +120,7 @@ def test_many_cycles_start_from_their_own_levels():
     np.testing.assert_allclose(np.std(off / error), 1.0, atol=0.3)
 
 
-def test_a_relaxing_force_tells_its_level_by_the_ramp_alone():
+def test_a_relaxing_force_shows_its_level_by_the_ramp_alone():
     """While the platen rests the force falls: the mean of that stretch is no level."""
     time, force = drive((0, 0), (100, PEAK), (160, PEAK), (260, 0), points=520)
     rest = (time > 100) & (time <= 160)
