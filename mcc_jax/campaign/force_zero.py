@@ -74,12 +74,12 @@ def zero_of_force(
     their line over time up to contact, and its value there from then on; what the drift did during the test nobody
     knows, so its change before contact is the error. Without readings before contact, see `_begins_elsewhere`.
     """
-    contact, ahead = air_until(curve, control)
+    contact, change = _air_until(curve, control)
     least = AIR_SHARE * float(np.ptp(curve.force_mN))
     if contact is None:
         # A rise before loading that is too quick to be taken for a drift, and too straight for a contact.
-        if ahead is not None and abs(ahead.change) > least:
-            return ZeroOfForce(0.0, 0.0, 0.0, PERHAPS_DRIFT.of(ahead.change))
+        if abs(change) > least:
+            return ZeroOfForce(0.0, 0.0, 0.0, PERHAPS_DRIFT.of(change))
         return _begins_elsewhere(curve, zero_mN, least)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(AIR_READINGS, int(0.9 * contact))
@@ -157,33 +157,30 @@ def _inflation(scatter: np.ndarray) -> float:
     return float(np.sqrt((1 + lag) / (1 - lag)))
 
 
-class SlowStart(NamedTuple):
-    """A straight course of force before loading, its readings, its change [mN], and its share of loading's slope."""
-
-    line: Line
-    stop: int
-    change: float
-    share: float
-
-
-def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowStart | None]:
-    """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
+def _air_until(curve: Curve, control: Control | None) -> tuple[int | None, float]:
+    """How many readings were taken before contact. If too few, None, and the change of force [mN] in a slower straight
+    course before loading, which may be a drift.
 
     Where `find_segments` finds no approach, it is looked for again without a straight and much slower rise, a drift.
     """
     contact = contact_index(find_segments(curve, control=control))
     if contact > AIR_READINGS:
-        return contact, None
+        return contact, 0.0
     ahead = slow_start(curve)
-    if ahead is None or ahead.share > DRIFT_SLOWER:
-        return None, ahead
-    drift = ahead.line.at(np.minimum(curve.time_s, curve.time_s[ahead.stop - 1]))
+    if ahead is None:
+        return None, 0.0
+    line, stop, share = ahead
+    change = line.slope * float(curve.time_s[stop - 1] - curve.time_s[0])
+    if share > DRIFT_SLOWER:
+        return None, change
+    drift = line.at(np.minimum(curve.time_s, curve.time_s[stop - 1]))
     contact = contact_index(find_segments(replace(curve, force_mN=curve.force_mN - drift), control=control))
-    return (contact if contact > AIR_READINGS else None), ahead
+    return (contact if contact > AIR_READINGS else None), change
 
 
-def slow_start(curve: Curve) -> SlowStart | None:
-    """A straight and slower course of force before loading, of a load cell that drifts; None without one.
+def slow_start(curve: Curve) -> tuple[Line, int, float] | None:
+    """A straight and slower course of force before loading, of a load cell that drifts: the line, how many readings it
+    has, and its slope as a share of loading's.
 
     A slower speed of the test machine, which bends force and displacement alike, is none.
     """
@@ -204,6 +201,4 @@ def slow_start(curve: Curve) -> SlowStart | None:
     distinct = fast.slope - slow.slope > DRIFT_SAID * error and share <= DRIFT_LIKE
     only_slower = pace > 0 and share > 0 and 1 / OTHER_STIFFNESS < share / pace < OTHER_STIFFNESS
     straight = np.std(slow.left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
-    if not distinct or only_slower or not straight:
-        return None
-    return SlowStart(slow, kink, slow.slope * float(time[kink - 1] - time[0]), share)
+    return (slow, kink, share) if distinct and straight and not only_slower else None
