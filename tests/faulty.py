@@ -91,6 +91,16 @@ def spiked(campaign, *, height=1e6, channel="displacement", at=77, only=None):
     return changed(campaign, change, only=only)
 
 
+def inserted(time, force, path, at, more, climb):
+    """A test with more forces behind a reading, while the platens climb so far; what follows is later and further."""
+    step, count = time[1] - time[0], len(more)
+    return (
+        np.concatenate([time[: at + 1], time[at] + step * np.arange(1, count + 1), time[at + 1 :] + step * count]),
+        np.concatenate([force[: at + 1], more, force[at + 1 :]]),
+        np.concatenate([path[: at + 1], path[at] + climb, path[at + 1 :] + climb[-1]]),
+    )
+
+
 @functools.cache
 def exact():
     """Four particles without noise; `noisy` adds it."""

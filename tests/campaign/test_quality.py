@@ -54,15 +54,10 @@ def test_a_hold_is_no_saturation(seed, readings, exactly):
     rng = np.random.default_rng(seed)
 
     def held(time, force, path):
-        top, step = int(np.argmax(force)), time[1] - time[0]
-        k = np.arange(1, readings + 1)
+        top, k = int(np.argmax(force)), np.arange(1, readings + 1)
         creep = 0.003 * path[top] * np.log1p(k / 5) / np.log1p(readings / 5)
         noise = np.zeros(readings) if exactly else 0.05 * rng.standard_normal(readings)
-        return (
-            np.concatenate([time[: top + 1], time[top] + step * k, time[top + 1 :] + step * readings]),
-            np.concatenate([force[: top + 1], force[top] + noise, force[top + 1 :]]),
-            np.concatenate([path[: top + 1], path[top] + creep, path[top + 1 :] + creep[-1]]),
-        )
+        return faulty.inserted(time, force, path, top, force[top] + noise, creep)
 
     checked = check_tests(noisy(faulty.changed(exact(), held), seed, noise_mN=0.0 if exactly else 0.05))
     assert not [one for one in campaign_findings(checked) if one.check == "saturation"]
@@ -262,15 +257,10 @@ def test_force_that_falls_while_the_platens_close_on_is_no_unloading(seed, at, r
         falls = before * (1 - lost * np.arange(1, readings + 1) / readings)
         rises = np.empty(0) if for_good else np.linspace(falls[-1], before, readings + 1)[1:-1]
         more = np.concatenate([falls, rises])
-        speed, step = (path[first] - path[first // 2]) / (first - first // 2), time[1] - time[0]
-        there = np.arange(1, len(more) + 1)
-        stop = first + 1 if for_good else len(force)
-        rest = slice(first + 1, stop)
-        return (
-            np.concatenate([time[: first + 1], time[first] + step * there, time[rest] + step * len(more)]),
-            np.concatenate([force[: first + 1], more, force[rest]]),
-            np.concatenate([path[: first + 1], path[first] + speed * there, path[rest] + speed * len(more)]),
-        )
+        climb = (path[first] - path[first // 2]) / (first - first // 2) * np.arange(1, len(more) + 1)
+        if for_good:
+            time, force, path = time[: first + 1], force[: first + 1], path[: first + 1]
+        return faulty.inserted(time, force, path, first, more, climb)
 
     slipped = faulty.changed(exact(), slipping, only=("2",))
     checked, found = only(noisy(slipped, seed), "breakage")
