@@ -16,13 +16,9 @@ def result():
     return calibrate_paper(paper_campaign(0))
 
 
-@pytest.fixture(scope="module")
-def one_material():
-    return calibrate_paper(paper_campaign(0, shared_material=True), threshold_MPa=0.0)
-
-
 @pytest.mark.extended
-def test_one_material_is_recovered_whole(one_material):
+def test_one_material_is_recovered_whole():
+    one_material = calibrate_paper(paper_campaign(0, shared_material=True), threshold_MPa=0.0)
     assert one_material.converged
     assert one_material.a == pytest.approx(1.43, abs=0.02)
     assert one_material.shape_reference.a == pytest.approx(1.43, abs=0.02)
@@ -53,16 +49,13 @@ def test_what_fills_up_counts_for_nothing(result, monkeypatch):
 
 
 def test_the_reference_can_be_named_and_used(result):
+    with pytest.raises(InputError, match="no particle '99'"):
+        calibrate_paper(result.campaign, reference="99")
     named = calibrate_paper(result.campaign, objective="reference", reference="5")
     assert named.shape_reference.reference == 4
     assert named.a == named.shape_reference.a
     assert named.a != result.a
     assert named.to_json()["reference_particle"] == "5"
-
-
-def test_an_unknown_reference_is_told(result):
-    with pytest.raises(InputError, match="no particle '99'"):
-        calibrate_paper(result.campaign, reference="99")
 
 
 @pytest.mark.extended
@@ -88,7 +81,6 @@ def test_too_few_particles_are_told():
 
 @pytest.mark.extended
 def test_without_unloading_there_is_no_modulus_and_the_rest_stands():
-
     campaign = paper_campaign(0, programme=Programme("load", (Ramp(1.0, 2.0),), points=150))
     content = calibrate_paper(campaign).to_json()
     assert content["effective_modulus_MPa"]["value"] is None

@@ -39,6 +39,11 @@ def scattered():
     return paper_campaign(0)
 
 
+@pytest.fixture(scope="module")
+def table(scattered):
+    return strain_table(adjust(scattered), scattered.diameters_um)
+
+
 # ---- adjustment ----
 
 
@@ -74,6 +79,8 @@ def test_adjusted_curves_do_not_depend_on_each_test_s_zero():
 
 def test_particles_below_the_threshold_are_left_out_with_the_reason():
     weak = paper_campaign(0, peak_stress_MPa=(0.05, 0.4), instrument=Instrument())
+    with pytest.raises(ValueError, match="threshold"):
+        adjust(weak, -0.1)
     adjustment = adjust(weak)
     assert 0 < adjustment.kept.sum() < 20
     for reason, curve in zip(adjustment.why_not, adjustment.curves, strict=True):
@@ -94,31 +101,17 @@ def test_cycles_give_the_same_loading_curve_as_one_ramp():
         np.testing.assert_allclose(many.at(grid), one.at(grid), rtol=2e-3)
 
 
-def test_a_negative_threshold_is_refused(exact):
-    with pytest.raises(ValueError, match="threshold"):
-        adjust(exact, -0.1)
-
-
 # ---- master curve ----
 
 
-def test_master_mean_and_spread_are_the_sample_s_own(scattered):
-    table = strain_table(adjust(scattered), scattered.diameters_um)
-    master = master_curve(table, 1.43)
+def test_the_master_curve_is_the_sample_s_own_as_far_as_a_fifth_of_the_particles(scattered, table):
+    master, curves = master_curve(table, 1.43), adjust(scattered).curves
     k = int(np.searchsorted(master.stress_MPa, 5.0))
-    values = [
-        eta * float(c.at(master.stress_MPa[k]))
-        for eta, c in zip(table.shape_factor(1.43), adjust(scattered).curves, strict=True)
-    ]
+    values = [eta * float(c.at(master.stress_MPa[k])) for eta, c in zip(table.shape_factor(1.43), curves, strict=True)]
     assert master.mean[k] == pytest.approx(np.mean(values), rel=1e-12)
     assert master.sd[k] == pytest.approx(np.std(values, ddof=1), rel=1e-12)
     assert master.count[k] == 20
-
-
-def test_master_curve_ends_where_a_fifth_of_the_particles_is_left(scattered):
-    table = strain_table(adjust(scattered), scattered.diameters_um)
-    master = master_curve(table, 1.43)
-    tops = np.sort([c.stress_max_MPa for c in adjust(scattered).curves])
+    tops = np.sort([c.stress_max_MPa for c in curves])
     assert master.count.min() > 4
     # The fifth largest of twenty maxima is the last stress that more than four particles reach.
     assert master.stress_MPa[-1] == pytest.approx(tops[-5], abs=table.stress_MPa[1])
@@ -169,8 +162,7 @@ def test_full_objective_is_the_paper_s_integral(scattered):
     assert objective_at(a, found) == pytest.approx(total, rel=1e-10)
 
 
-def test_reference_objective_is_the_paper_s_integral(scattered):
-    table = strain_table(adjust(scattered), scattered.diameters_um)
+def test_reference_objective_is_the_paper_s_integral(table):
     row, a = choose_reference(table), 0.7
     eta, total = table.shape_factor(a), 0.0
     use = table.reached.sum(axis=0) > 4
@@ -185,8 +177,7 @@ def test_reference_objective_is_the_paper_s_integral(scattered):
 
 
 @pytest.mark.extended
-def test_the_minimum_is_one(scattered):
-    table = strain_table(adjust(scattered), scattered.diameters_um)
+def test_the_minimum_is_one(table):
     use = table.reached.sum(axis=0) > 4
     grid, strain, reached = table.stress_MPa[use], table.strain[:, use], table.reached[:, use]
     row, flatness = choose_reference(table), table.flatness
@@ -210,23 +201,17 @@ def test_reference_follows_the_paper_s_rule(exact):
 
 
 @pytest.mark.extended
-def test_equal_particles_cannot_tell_the_shape_parameter():
-    grid = np.linspace(0, 5, 50)
-    strain = np.sqrt(grid) * np.array([[1.0], [1.1], [0.9]])
-    table = StrainTable(grid, strain, np.ones((3, 50), bool), np.full(3, 0.3), np.arange(3))
-    fit = fit_shape_parameter(table)
-    assert not fit.converged
-    assert "same D3^2" in fit.reason
-
-
-@pytest.mark.extended
-def test_negative_shape_parameters_are_found():
-    flatness = np.linspace(0.0, 0.6, 8)
-    grid = np.linspace(0, 5, 200)
-    strain = np.sqrt(grid) / (1 - 0.85 * flatness)[:, None]
-    table = StrainTable(grid, strain, np.ones((8, 200), bool), flatness, np.arange(8))
-    for objective in ("full", "reference"):
-        assert fit_shape_parameter(table, objective).a == pytest.approx(-0.85, abs=1e-6)
+@pytest.mark.parametrize("objective", ["full", "reference"])
+def test_negative_shape_parameters_are_found_and_equal_particles_have_none(objective):
+    grid, reached = np.linspace(0, 5, 200), np.ones((8, 200), bool)
+    for flatness in (np.linspace(0.0, 0.6, 8), np.full(8, 0.3)):
+        strain = np.sqrt(grid) / (1 - 0.85 * flatness)[:, None]
+        fit = fit_shape_parameter(StrainTable(grid, strain, reached, flatness, np.arange(8)), objective)
+        if np.ptp(flatness):
+            assert fit.a == pytest.approx(-0.85, abs=1e-6)
+        else:
+            assert not fit.converged
+            assert "same D3^2" in fit.reason
 
 
 # ---- plastic coefficients ----
@@ -272,10 +257,6 @@ def test_a_spread_that_leaves_nothing_for_a_term_collapses_and_is_named():
 # ---- effective modulus ----
 
 
-def _branches(campaign, threshold):
-    return campaign_branches(campaign, adjust(campaign, threshold))
-
-
 def _eta(campaign):
     D1, D2, D3 = campaign.diameters_um.T
     return 1 + 1.43 * (1 - D3**2 / (D1 * D2))
@@ -286,7 +267,8 @@ def test_modulus_of_exact_branches_is_recovered_in_every_form(unloading, scaling
     campaign = paper_campaign(
         2, shared_material=True, instrument=Instrument(), unloading=unloading, strain_scaling=scaling
     )
-    fit = fit_effective_modulus(_branches(campaign, 0.0), _eta(campaign), unloading, scaling)
+    branches = campaign_branches(campaign, adjust(campaign, 0.0))
+    fit = fit_effective_modulus(branches, _eta(campaign), unloading, scaling)
     assert fit.converged
     assert fit.effective_modulus_MPa == pytest.approx(16e3, rel=2e-3)
 
@@ -294,7 +276,7 @@ def test_modulus_of_exact_branches_is_recovered_in_every_form(unloading, scaling
 def test_every_cycle_is_a_branch_and_reloading_belongs_to_it():
     programme = Programme.cycles(levels=(0.4, 0.7, 1.0), unload_to=0.3, points=900)
     campaign = paper_campaign(0, shared_material=True, programme=programme)
-    branches = _branches(campaign, 0.2)
+    branches = campaign_branches(campaign, adjust(campaign, 0.2))
     assert len(branches) == 60
     fit = fit_effective_modulus(branches, _eta(campaign))
     assert fit.effective_modulus_MPa == pytest.approx(16e3, rel=0.03)
