@@ -14,10 +14,8 @@ from jax.sharding import Mesh, PartitionSpec
 from . import arguments
 from ._errors import InputError
 
-CONTACTS = 512
-"""In a block: the few arrays that a loop over one takes then come from a core's first cache."""
-NUMBERS = 4096
-"""Of one array in a block of paths: with the dozen arrays between, half of a small core's second cache."""
+CONTACTS = 512  # in a block: the few arrays that a loop over one takes then come from a core's first cache
+NUMBERS = 4096  # of one array in a block of paths: with the dozen arrays between, half of a small core's second cache
 
 
 def in_blocks[**P, R](
@@ -55,7 +53,7 @@ def in_blocks[**P, R](
         largest = _suitable(arguments) if block is None else block
         if count <= largest:
             return one(*arguments)
-        size = _even(count, largest)
+        size = even_size(count, largest)
         whole = count // size * size
         parts = jax.tree.map(lambda x: x[:whole].reshape(-1, size, *x.shape[1:]), arguments)
         found = jax.lax.map(lambda part: one(*part), parts)
@@ -82,9 +80,11 @@ def _suitable(arguments: Any) -> int:
     return max(1, min(CONTACTS, NUMBERS // max(each, 1)))
 
 
-def _even(count: int, block: int) -> int:
-    """The largest size of a block that leaves nothing over, if one is not much smaller than asked for."""
-    return next((size for size in range(block, block // 2, -1) if count % size == 0), block)
+def even_size(count: int, block: int) -> int:
+    """The largest size of a block that leaves no remainder, which would be compiled again, if it is at least half of
+    what was asked for."""
+    block = max(1, min(count, block))
+    return next((size for size in range(block, (block - 1) // 2, -1) if count % size == 0), block)
 
 
 def _check(arguments: Any, shares: int) -> None:

@@ -25,16 +25,6 @@ def compiled_quickly[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     return compiled(function, 0)
 
 
-def even_batch(count: int, most: int) -> int:
-    """How many of `count` to work on at once, at most `most`: without a remainder, if that is not far fewer.
-
-    `jax.lax.map` compiles its function again for the remainder.
-    """
-    most = max(1, min(count, most))
-    even = next(size for size in range(most, 0, -1) if count % size == 0)
-    return even if 2 * even >= most else most
-
-
 def imported_meanwhile(*names: str) -> None:
     """Import what is needed later while the first programs are compiled: together they would take seconds longer."""
     for name in names:
@@ -60,12 +50,10 @@ def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> li
 
 
 def make_room() -> None:
-    """Forget what JAX has compiled, everybody's, where the process would soon hold more than the system allows.
+    """Forget what JAX has compiled where the process would soon hold more memory maps than Linux allows.
 
-    Every compiled function holds about three memory maps, a campaign of a new length several hundred functions, and
-    Linux allows a process 65,530 maps: after some thirty campaigns XLA would fail ("LLVM compilation error: Cannot
-    allocate memory") and take the process along. What is needed again is compiled again. Other systems have no such
-    limit, and nothing happens there.
+    Every compiled function holds about three of 65,530 maps, a campaign of a new length several hundred functions:
+    after some thirty campaigns XLA would fail ("LLVM compilation error: Cannot allocate memory").
     """
     try:
         with MAPS.open("rb") as lines:

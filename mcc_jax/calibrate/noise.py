@@ -59,15 +59,8 @@ class Along(enum.Enum):
 
 
 class Noise(eqx.Module):
-    """Standard deviations of a campaign's noise.
-
-    Attributes:
-        displacement: white noise of displacement [um].
-        force: white noise of force [mN].
-        correlated: standard deviation of the correlated residual [um].
-        length: its correlation length, in shares of the peak force passed [-], or in seconds.
-        scale: each particle's own factor on all of them [-], shape (N,).
-    """
+    """Standard deviations of white noise of displacement [um] and force [mN] and of the correlated residual [um], its
+    correlation length, in shares of the peak force passed [-] or in seconds, and each particle's factor on all [-]."""
 
     displacement: Scalar
     force: Scalar
@@ -98,11 +91,10 @@ MASKED_UM2 = 1e12
 
 
 class Whitening(eqx.Module):
-    """The factored covariance of one test's noise, ready to turn residuals into independent ones of variance 1.
+    """The factored covariance of one test's noise, which turns residuals into independent ones of variance 1.
 
-    `solver` is the factor of the quasiseparable part, white and correlated noise; `peak` the whitened change of every
-    point with the error of its branch's peak, 0 on loading; `branch` which branch a point belongs to; `common` the
-    whitened change with the error of the zero of force, None where none was measured; `weights` those of the readings.
+    `solver` is the factor of the quasiseparable part, white and correlated noise; `peak` and `common` the whitened
+    changes of every point with the errors of its branch's peak and of the zero of force.
     """
 
     solver: QuasisepSolver
@@ -331,14 +323,8 @@ OUTLYING = 5.0  # a particle whose noise differs by so many standard deviations 
 
 
 class NoiseFit(eqx.Module):
-    """The noise of a campaign, by restricted maximum likelihood with its prior.
-
-    Attributes:
-        noise: its numbers.
-        covariance: of the logarithms of the four numbers; NaN where it was not worked out.
-        log_evidence: what the four numbers add to a log marginal likelihood: log prior and Laplace's volume.
-        converged: whether the optimiser met its tolerances.
-    """
+    """The noise of a campaign, covariance of the logarithms of its four numbers, what these add to a log marginal
+    likelihood (log prior and Laplace's volume; NaN where not worked out), and whether the optimiser converged."""
 
     noise: Noise
     covariance: Float[Array, "4 4"]
@@ -391,10 +377,8 @@ def estimate_noise(
 
 
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter beyond chance.
-
-    The sums of squares were whitened with the given scales and have so many degrees of freedom, all of shape (N,).
-    """
+    """Every particle's scale from its sum of squares, whitened with the given scales and of so many degrees of freedom,
+    pulled towards 1 unless they scatter beyond chance."""
     freedom = np.maximum(freedom, 1)
     log_scale = np.log(scale) + 0.5 * np.log(np.maximum(squares / freedom, 1e-12))
     chance = 0.5 / freedom

@@ -27,13 +27,7 @@ snaps = compiled(jax.vmap(snap))
 
 
 class ParticleFits(eqx.Module):
-    """Fits of single particles.
-
-    Attributes:
-        point: where they ended.
-        rms: root mean square residual [um].
-        converged: whether the best start's fit met its tolerances.
-    """
+    """Where fits of single particles ended, root mean square residual [um], whether the tolerances were met."""
 
     point: Point
     rms: Float[Array, " particles"]

@@ -27,8 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
+from .._blocks import even_size
 from .._types import Scalar
-from .compiling import compiled, even_batch, side_by_side
+from .compiling import compiled, side_by_side
 from .data import Tests
 from .forward import Forms, Point, residuals
 from .importance import MOST_PARETO_K, ordered_resample, pareto_k, relative_scatter, smoothed_weights
@@ -61,10 +62,8 @@ SIDE_BY_SIDE = 2  # pieces that draws are cut into on a CPU, on any number of co
 
 
 class ParticleDraws(NamedTuple):
-    """Draws of the particles' parameters, one for each draw of the population; see `ParticleDraw`.
-
-    `log_ratio` is the log of exact over quadratic likelihood; 0 where the exact one was not looked at.
-    """
+    """Draws of the particles' parameters, one for each draw of the population, and the log of exact over quadratic
+    likelihood; 0 where the exact one was not looked at."""
 
     latent: Float[Array, "draws particles 4"]
     theta: Float[Array, "draws particles numbers"]
@@ -74,10 +73,8 @@ class ParticleDraws(NamedTuple):
 
 
 class ExactLikelihood(eqx.Module):
-    """Tests with their noise and their exact likelihood, and the summaries that particles are drawn by.
-
-    The zero's prior is two numbers, mean and standard deviation [um], which cutting into blocks leaves alone.
-    """
+    """Tests with their noise, the summaries that particles are drawn by, and mean and standard deviation of the zeros'
+    prior [um]."""
 
     tests: Tests
     filters: Whitening
@@ -110,15 +107,13 @@ def draw_particles(
 
     Args:
         keys: data of one random key, for every particle.
-        exact: the tests.
-        population: draws, every field with a leading axis.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
         common: use the same random numbers for every draw of the population.
-    """
-    draws = population.a.shape[0]
-    count = len(exact.tests)
 
-    numbers = exact.marginal.point.theta.shape[1]
+    Returns:
+        Arrays with the particles first, then the draws.
+    """
+    draws, count, size = population.a.shape[0], len(exact.tests), exact.marginal.scatter.size
 
     def one(arguments):
         key, row = arguments
@@ -136,41 +131,37 @@ def draw_particles(
                 square = 0.5 * (jnp.sum(normal**2, -1) + normal_zero**2)
                 proposal = -square - drawn.log_volume
                 if candidates > 1:
-                    far = -square / REACH**2 - (exact.marginal.scatter.size + 1) * math.log(REACH)
+                    far = -square / REACH**2 - (size + 1) * math.log(REACH)
                     proposal = jnp.logaddexp(-square, far) - math.log(2) - drawn.log_volume
                 ratio = truth + prior - proposal - drawn.log_likelihood
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
-            theta: Any = drawn.theta if numbers else None
-            return drawn.latent, theta, drawn.zero, drawn.log_likelihood, ratio
+            # In one array: `map` cannot cut effects' numbers into batches where there are none.
+            numbers = jnp.concatenate([drawn.latent, drawn.theta, drawn.zero[:, None]], 1)
+            return numbers, drawn.log_likelihood, ratio
 
         shape = (max(candidates, 1), count)
-        latent, theta, zero, likelihood, ratio = jax.vmap(candidate)(
-            jax.random.normal(deviate, (*shape, exact.marginal.scatter.size)),
+        numbers, likelihood, ratio = jax.vmap(candidate)(
+            jax.random.normal(deviate, (*shape, size)),
             jax.random.normal(zeros, shape),
             jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, REACH),
         )
         if candidates <= 1:
-            return latent[0], theta[0] if numbers else theta, zero[0], likelihood[0], ratio[0]
+            return numbers[0], likelihood[0], ratio[0]
         chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
         mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
-
-        def take(values):
-            return jnp.take_along_axis(values, chosen.reshape(1, count, *[1] * (values.ndim - 2)), axis=0)[0]
-
-        return take(latent), take(theta) if numbers else theta, take(zero), likelihood[0], mean
+        return jnp.take_along_axis(numbers, chosen[None, :, None], axis=0)[0], likelihood[0], mean
 
     rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
-    batch = even_batch(draws, rows // (count * max(candidates, 1)))
+    batch = even_size(draws, rows // (count * max(candidates, 1)))
     key = jax.random.wrap_key_data(keys[0])
     each = jnp.where(common, key[None], jax.random.split(key, draws))
-    # Arrays without an entry are left out: `map` cannot cut them in batches.
-    latent, theta, *rest = jax.lax.map(one, (each, jnp.arange(draws)), batch_size=batch)
-    found = latent, jnp.zeros((draws, count, 0)) if theta is None else theta, *rest
-    return ParticleDraws(*(jnp.swapaxes(x, 0, 1) for x in found))
+    found = jax.lax.map(one, (each, jnp.arange(draws)), batch_size=batch)
+    numbers, likelihood, ratio = (jnp.swapaxes(x, 0, 1) for x in found)
+    return ParticleDraws(numbers[..., :4], numbers[..., 4:-1], numbers[..., -1], likelihood, ratio)
 
 
 class Length(NamedTuple):
-    """How long a sampler runs: chains, and draws of each before and after it has settled."""
+    """Chains, and draws of each during and after warm-up."""
 
     chains: int
     warmup: int
@@ -193,14 +184,13 @@ def some_of(population: Population, rows: slice | np.ndarray) -> Population:
 
 
 class Drawer:
-    """Draws of the particles, as arrays of NumPy with the axes (draw, particle), without padding.
+    """Draws of the particles, in blocks of so many, as arrays of NumPy with the axes (draw, particle).
 
     `chunk` draws of the population are worked on in one call, so that one compilation serves any number of them; all
-    by default. Chunks run next to each other where all particles are one block (`block` = 0).
+    by default. Chunks run next to each other where all particles are one block.
     """
 
     def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:
-        """Cut the tests into blocks of so many particles."""
         self.count = len(exact.tests)
         self._exact, self._blocks, self._chunk = exact, Blocks(self.count, block), chunk
 
@@ -237,14 +227,8 @@ class Drawer:
         scattering: np.ndarray,
         candidates: Iterable[int],
     ) -> None:
-        """Draw particles with scattering weights again, in place, from many candidates; update their Pareto k, too.
-
-        Args:
-            drawn: all particles under `population`; theirs are replaced.
-            k: Pareto k of every particle.
-            scattering: positions of those whose weights scatter.
-            candidates: how many per draw: first, and for the few that scatter most even then.
-        """
+        """Draw particles with scattering weights again, in place, and their Pareto k; from several candidates per draw
+        first, then, for the few that scatter most even so, from more."""
         latent, theta, zero, _, ratio = (cast(np.ndarray, v) for v in drawn)
         few = max(FEW, self.count // 100)
         for many in candidates:
@@ -260,11 +244,8 @@ class Drawer:
 
 
 class Drawn(NamedTuple):
-    """Particles drawn back under every `keep`-th of the draws of the population that were chosen by weight.
-
-    `k` is the Pareto k of every particle's weights, `k_joint` that of the population's; `log_ratio` the logarithm of
-    the mean ratio of exact to quadratic likelihood of all tests, and its standard error.
-    """
+    """Particles under every `keep`-th of the draws of the population that were chosen by weight, Pareto k of theirs and
+    of the population's weights, log of the mean ratio of exact to quadratic likelihood and its standard error."""
 
     chosen: np.ndarray
     particles: ParticleDraws

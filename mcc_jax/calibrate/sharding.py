@@ -76,10 +76,8 @@ class Blocks:
     def all(self, function: Callable[..., Any], particles: tuple[Any, ...], *shared: Any) -> Any:
         """`function(*particles, *shared)` of all particles, a block at a time on each device.
 
-        Args:
-            function: from `compiled`, for all devices at once; any other calls compiled functions one after the other.
-            particles: trees of arrays with the particles first, as those of the result; numbers without axes are left.
-            shared: what does not depend on the particles.
+        `particles` are trees of arrays with the particles first, as those of the result; numbers without axes are left.
+        A function from `compiled` runs on all devices at once, any other calls compiled functions one after the other.
         """
         if self.number == 1 and self.size == self.count:
             return function(*particles, *shared)
@@ -151,11 +149,7 @@ def _exchanged(arrays: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def require_same(tests: Tests) -> None:
-    """Make sure that all processes have the same tests.
-
-    Raises:
-        InputError: if they do not.
-    """
+    """Raise `InputError` unless all processes have the same tests."""
     if jax.process_count() == 1:
         return
     digest = hashlib.sha256()
