@@ -171,6 +171,7 @@ def _with_unit(value: float | None, form: str, unit: str) -> str:
 @common.campaign
 @common.out(required=True)
 @common.exclude
+@common.leave_out
 @common.threshold(default=0.0)
 @common.priors()
 @common.law
@@ -192,7 +193,7 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
         from ..effects import LIBRARY
 
         require_mechanisms(options["exclude"])
-        data = read_without(campaign, (), progress)
+        data = read_without(campaign, options["leave_out"], progress)
         with results(out) as stage:
             found = power_of_campaign(
                 data,

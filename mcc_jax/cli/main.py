@@ -73,8 +73,6 @@ def one_line(text: str) -> str:
 def explain(error: BaseException, debug: bool) -> Stop:
     """What a run that ended with this error reports; `debug` prints the traceback of a defect."""
     match error:
-        case Stop():
-            return error
         case KeyboardInterrupt() | click.Abort():
             return Stop(INTERRUPTED, "interrupted")
         case BrokenPipeError():  # the reader of our output has seen enough; Python flushes it once more at its end
@@ -83,9 +81,6 @@ def explain(error: BaseException, debug: bool) -> Stop:
             return Stop(DONE, "")
         case InputError():
             problem = str(error)
-        case click.MissingParameter(param=click.Option(name="out"), ctx=click.Context(command_path=command)):
-            remedy = f"Add --out DIR, a new folder or one of earlier results; see '{command} --help'."
-            problem = f"no folder is given for the results. {remedy}"
         case click.UsageError():
             command, problem = error.ctx.command_path if error.ctx else PROGRAM, one_line(error.format_message())
             problem += f"{'' if problem.endswith(('.', '?', ')')) else '.'} See '{command} --help'."
@@ -96,20 +91,12 @@ def explain(error: BaseException, debug: bool) -> Stop:
         case OSError(errno=errno.ENOSPC | errno.EFBIG | errno.EDQUOT | errno.EIO):
             problem = f"output cannot be written: {error.strerror}. Make room and run again."
         case _:
-            return _defect(error, debug)
+            if debug:
+                click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
+            report = f"please report it{'' if debug else ' with the output of --debug'}"
+            found = f"internal error: {type(error).__name__}: {one_line(str(error))[:300]}"
+            return Stop(DEFECT, f"{found}. This is a defect of {PROGRAM}; {report}.")
     return Stop(BAD_INPUT, f"error: {problem}")
-
-
-def _defect(error: BaseException, debug: bool) -> Stop:
-    if debug:
-        click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
-        hint = ""
-    else:
-        hint = " with the output of --debug"
-    name, text = type(error).__name__, one_line(str(error))
-    if len(text) > 300:
-        text = text[:300] + "..."
-    return Stop(DEFECT, f"internal error: {name}: {text}. This is a defect of {PROGRAM}; please report it{hint}.")
 
 
 @contextlib.contextmanager

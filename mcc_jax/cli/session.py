@@ -122,33 +122,33 @@ def _logged(stream: Any) -> Iterator[Progress]:
 
     Lines are held back for `QUIET_S`, counted from the second step, so that bad input is answered by its error alone.
     """
-    began, waiting, lock, shown = time.monotonic(), list[str](), threading.Lock(), threading.Event()
-
-    def progress(step: str) -> None:
-        with lock:
-            waiting.append(f"{PROGRAM}: {time.monotonic() - began:6.1f} s  {step}\n")
-            if len(waiting) == 2 and timer.ident is None:
-                timer.start()
-        if shown.is_set():
-            write()
+    began, lines, lock = time.monotonic(), list[str](), threading.Lock()
 
     def write() -> None:
         with lock, contextlib.suppress(OSError):  # a reader that is gone does not end the work
-            shown.set()
-            stream.write("".join(waiting))
-            waiting.clear()
+            stream.write("".join(lines))
+            lines.clear()
             stream.flush()
 
     timer = threading.Timer(QUIET_S, write)
     timer.daemon = True
+
+    def progress(step: str) -> None:
+        with lock:
+            lines.append(f"{PROGRAM}: {time.monotonic() - began:6.1f} s  {step}\n")
+        if timer.finished.is_set():  # it has written once
+            write()
+        elif len(lines) == 2 and timer.ident is None:
+            timer.start()
+
     try:
         yield progress
+        if timer.finished.is_set():
+            progress("done")
     finally:
         timer.cancel()
         if timer.ident is not None:
             timer.join()
-    if shown.is_set():
-        progress("done")
 
 
 def say(text: str = "", **style: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from .._format import interval, listed, plain, with_sd
@@ -90,7 +90,7 @@ def summary_of(found: Discovery) -> str:
         sentences.append(text)
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
         sentences.append(_modulus(found.parameters_before, found.parameters_after))
-    sentences += _next(found)
+    sentences += next_tests(found.next_experiments, found.checks)
     if found.untestable:
         needs = "; ".join(f"{plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
         sentences.append(f"These tests say nothing about {needs}.")
@@ -135,9 +135,10 @@ def _gap(found: Discovery) -> list[str]:
     return sentences
 
 
-def _next(found: Discovery) -> list[str]:
+def next_tests(experiments: Sequence[Mapping[str, Any]], checks: Sequence[Mapping[str, str]]) -> list[str]:
+    """Which further test, or which direct checks, would separate the candidates, in sentences."""
     sentences = []
-    best = found.next_experiments[0] if found.next_experiments else None
+    best = experiments[0] if experiments else None
     sure = best is not None and best["power"] >= ENOUGH
     if best is not None:
         names = listed([plain(n) for n in best["separates"]], "or")
@@ -146,8 +147,8 @@ def _next(found: Discovery) -> list[str]:
             f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles; "
             f"with these it would separate {names} with probability {best['power']:.2f}."
         )
-    if found.checks and not sure:
-        each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKS])
+    if checks and not sure:
+        each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in checks[:CHECKS])
         sentences.append(f"Each would show by itself ({each}).")
     return sentences
 

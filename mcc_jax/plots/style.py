@@ -165,7 +165,7 @@ def finish(
     width = int(figure.get_size_inches()[0] * 13)
     lines = [line for text in warnings for line in textwrap.wrap(text[:1].upper() + plain(text[1:], 400), width)]
     colour = VERMILION if lines else BLACK
-    figure.suptitle("\n".join([title, *lines]) or " ", x=0.01, ha="left", fontsize=10.0, color=colour)
+    figure.suptitle("\n".join(filter(None, [title, *lines])) or " ", x=0.01, ha="left", fontsize=10.0, color=colour)
     if is_simulated(campaign.metadata):
         figure.text(0.99, 0.995, "simulated data", ha="right", va="top", fontsize=SMALL, color=GREY)
     if handles:

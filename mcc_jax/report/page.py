@@ -6,7 +6,6 @@ import math
 import re
 import shlex
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from .._extras import extra, own_version
@@ -16,14 +15,14 @@ from ..calibrate.curves import KINDS, FittedCurve
 from ..calibrate.estimates import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
-from ..discovery.sentences import verdict_in_words
+from ..discovery.sentences import headline, verdict_in_words
 from .read import Results
 
 with extra("report"):
     from ..plots.style import particle_labels
     from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
     from .checks import Check, check_results, share_inside, tested
-    from .story import data_uri, example_of, example_pictures, tiles, verdict_of
+    from .story import data_uri, example_of, example_pictures, tiles
     from .texts import (
         METHODS,
         calibration_sentences,
@@ -112,7 +111,8 @@ def _environment() -> Any:
     )
     # Bokeh wants a model before what refers to it.
     found.policies["json.dumps_kwargs"] = {"sort_keys": False, "allow_nan": False, "separators": (",", ":")}
-    found.globals |= {"plain_name": quantity, "exp": math.exp}
+    paper = {"a": PAPER_SHAPE_PARAMETER, "modulus_MPa": PAPER_EFFECTIVE_MODULUS_MPA, "log_C": PAPER_LOG_C}
+    found.globals |= {"plain_name": quantity, "exp": math.exp, "paper": paper, "methods": METHODS}
     filters = (number, percent, probability, with_sd, interval, plain, listed, exponential, spread, equation)
     found.filters |= {one.__name__: one for one in filters} | {"verdict": verdict_in_words}
     return found
@@ -131,23 +131,26 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     folder = shlex.quote(results.name)
     checks, law = check_results(results, shown), law_of(results)
     example = example_of(results, shown)
+    sentences = [] if results.calibration is None else calibration_sentences(results.calibration, law)
+    if results.discovery is not None:
+        sentences.insert(0, headline(results.discovery, "simulated tests" if simulated(results) else "tests"))
+    count = 0 if results.campaign is None else len(results.campaign)
+    measured_only = f"{count} particles were measured; nothing has been calibrated on them yet."
     return {
         "results": results,
         "version": own_version(),
         "simulated": simulated(results),
         "sections": _sections(results, shown, checks),
-        "verdict": verdict_of(results),
+        "verdict": sentences[0] if sentences else measured_only,
         "pictures": [] if example is None else example_pictures(example),
         "caption": "" if example is None else example.caption,
         "tiles": [] if results.discovery is None else tiles(results.discovery),
         "cards": _cards(results, checks, law),
-        "summary": [] if results.calibration is None else calibration_sentences(results.calibration, law),
+        "summary": sentences[1:],
         # A command is copied: its blanks stay as they are.
         "next_steps": [(text, escape(command)) for text, command in next_steps(results, folder)],
         "facts": [] if results.campaign is None else measured(results.campaign),
         "rows": particle_rows(results),
-        "paper": {"a": PAPER_SHAPE_PARAMETER, "modulus_MPa": PAPER_EFFECTIVE_MODULUS_MPA, "log_C": PAPER_LOG_C},
-        "methods": METHODS,
         "shown": shown,
         "bands": share_inside(shown) is not None,
         "labels": labels,
@@ -156,7 +159,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "chart": {"bokeh": chart_items(), "data": chart_data(shown, labels, particle_facts(results, shown))}
         if shown
         else None,
-        "bokeh": Markup(_closed(chart_scripts())) if shown else "",
+        "bokeh": Markup(chart_scripts()) if shown else "",
         "draws": results.posterior is not None,
         "checks": checks,
         "changes": [] if results.discovery is None else changes(results.discovery),
@@ -165,19 +168,8 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "folder": folder,
         "law": law,
         "law_alone": is_law_alone(results),
-        "style": Markup(_source("style.css")),
-        "script": Markup(_closed(_source("page.js"))),
         "versions": next((one.versions for one in results.provenance.values() if one.versions), {}),
     }
-
-
-def _source(name: str) -> str:
-    return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
-
-
-def _closed(script: str) -> str:
-    """A script that cannot end its element early."""
-    return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
 
 
 def _cards(results: Results, checks: list[Check], law: str) -> list[dict[str, str]]:

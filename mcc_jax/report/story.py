@@ -18,10 +18,9 @@ from matplotlib.transforms import ScaledTranslation
 from .._format import listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import FittedCurve
 from ..discovery import Discovery
-from ..discovery.sentences import headline
 from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, VERMILION, Look, is_simulated, new_figure
 from .read import Results
-from .texts import quantity, simulated
+from .texts import quantity
 
 FEWEST = 12
 """Least number of readings in the enlarged part of a test that has them."""
@@ -214,19 +213,6 @@ def data_uri(picture: bytes, kind: str = "png") -> str:
 
 
 # ---- the words -------------------------------------------------------------------------------------------------------
-
-
-def verdict_of(results: Results) -> str:
-    """The answer in one sentence."""
-    if results.discovery is not None:
-        return headline(results.discovery, "simulated tests" if simulated(results) else "tests")
-    if results.calibration is not None:
-        content = results.calibration
-        used = sum(entry["kept"] for entry in content["particles"])
-        state = f"The law was calibrated on {used} of {len(content['particles'])} particles"
-        return f"{state}." if content["converged"] else f"{state}; the calibration did not converge."
-    count = 0 if results.campaign is None else len(results.campaign)
-    return f"{count} particles were measured; nothing has been calibrated on them yet."
 
 
 def tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from .._format import interval, listed, number, percent, plain, probability, span, with_sd
+from .._format import interval, listed, number, percent, plain, span, with_sd
 from ..calibrate.curves import FittedCurve
 from ..calibrate.estimates import quantities
 from ..campaign import Campaign, campaign_segments, effective_diameter_um
-from ..discovery.settings import ENOUGH
+from ..discovery.sentences import next_tests
 from ..plots.style import is_simulated
 from .read import Results
 
@@ -158,18 +158,9 @@ def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
 
 def _after(found: dict[str, Any], *, added: bool) -> list[tuple[str, str]]:
     """What to do after a discovery; `added` if the page is of the law with what was added already."""
-    verdict = found["verdict"]
-    if found["next_experiments"]:
-        best = found["next_experiments"][0]
-        names, power = listed([plain(n) for n in best["separates"]]), probability(best["power"])
-        test = f"{best['experiment']}, {number(best['particles'])} further particles"
-        if best["power"] >= ENOUGH:
-            return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
-        doubt = f"No further test of those tried on paper would surely separate {names}."
-        return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]
-    if found["checks"]:
-        first = found["checks"][0]
-        return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
+    verdict, separating = found["verdict"], next_tests(found["next_experiments"], found["checks"])
+    if separating:
+        return [(" ".join(separating), "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
         if added:
             return [("Use the law together with what was added: the parameters below are of both.", "")]

@@ -44,7 +44,7 @@ def test_a_run_killed_at_any_move_leaves_the_old_results_or_the_new_ones(tmp_pat
 
         return move
 
-    def write():
+    def killed_run():
         with results(tmp_path) as stage:
             stage.stale += ["stale", "a"]
             (stage.folder / "sub").mkdir()
@@ -54,7 +54,7 @@ def test_a_run_killed_at_any_move_leaves_the_old_results_or_the_new_ones(tmp_pat
             monkeypatch.setattr(Path, "unlink", killed(unlink))
 
     with pytest.raises(KeyboardInterrupt):
-        write()
+        killed_run()
     monkeypatch.undo()
     assert (tmp_path / READY).exists() == (at > 0)
     with results(tmp_path):  # whoever reads first in the next run sees
@@ -64,32 +64,25 @@ def test_a_run_killed_at_any_move_leaves_the_old_results_or_the_new_ones(tmp_pat
     assert not any(name.startswith(".mcc-jax") for name in snapshot(tmp_path))
 
 
-def test_a_folder_where_a_file_belongs(tmp_path):
-    (tmp_path / "one.txt").mkdir()
-    (tmp_path / "a.txt").write_text("old")
-    before = snapshot(tmp_path)
-
-    def write():
-        with results(tmp_path) as stage:
-            (stage.folder / "a.txt").write_text("new")
-            (stage.folder / "one.txt").write_text("1")
-
-    with pytest.raises(InputError, match=r"one\.txt there is a folder"):
-        write()
-    assert snapshot(tmp_path) == before
+def write(folder, **files):
+    """Results of these names and texts; an underscore means a subfolder."""
+    with results(folder) as stage:
+        for name, text in files.items():
+            file = stage.folder / name.replace("_", "/")
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(text)
 
 
-def test_a_file_where_a_folder_belongs(tmp_path):
+def test_a_folder_where_a_file_belongs_and_a_file_where_a_folder(tmp_path):
+    (tmp_path / "one").mkdir()
     (tmp_path / "sub").write_text("mine")
-
-    def write():
-        with results(tmp_path) as stage:
-            (stage.folder / "sub").mkdir()
-            (stage.folder / "sub" / "one.txt").write_text("1")
-
+    (tmp_path / "a").write_text("old")
+    before = snapshot(tmp_path)
+    with pytest.raises(InputError, match=r"one there is a folder"):
+        write(tmp_path, a="new", one="1")
     with pytest.raises(InputError, match="Not a directory"):
-        write()
-    assert snapshot(tmp_path) == {"sub": b"mine"}
+        write(tmp_path, a="new", sub_one="1")
+    assert snapshot(tmp_path) == before
 
 
 def test_a_folder_within_a_stage_appears_with_it(tmp_path):
@@ -100,43 +93,32 @@ def test_a_folder_within_a_stage_appears_with_it(tmp_path):
     assert snapshot(tmp_path) == {"inner": None, "inner/one.txt": b"1"}
 
 
+def failing(error, folder):
+    with results(folder) as stage:
+        raise error(stage)
+
+
 def test_the_users_folder_is_named_not_the_stage(tmp_path):
-    def write():
-        with results(tmp_path / "out") as stage:
-            raise InputError("cannot be written", file=stage.folder / "campaign", remedy="Make room")
+    def error(stage):
+        return InputError("cannot be written", file=stage.folder / "campaign", remedy="Make room")
 
     with pytest.raises(InputError) as caught:
-        write()
+        failing(error, tmp_path / "out")
     assert str(caught.value) == f"{tmp_path / 'out'}: cannot be written. Make room"
     assert snapshot(tmp_path) == {}
 
 
-def test_a_full_disk_is_bad_luck_not_a_defect(tmp_path):
-    def write():
-        with results(tmp_path):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+def test_a_full_disk_is_bad_luck_and_an_error_of_another_file_is_not_ours(tmp_path):
     with pytest.raises(InputError, match=r"No space left on device\. Make room"):
-        write()
-
-
-def test_an_error_of_another_file_is_not_ours(tmp_path):
-    def read():
-        with results(tmp_path):
-            raise FileNotFoundError(errno.ENOENT, "no such file", "/somewhere/else")
-
+        failing(lambda _: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), tmp_path)
     with pytest.raises(FileNotFoundError):
-        read()
+        failing(lambda _: FileNotFoundError(errno.ENOENT, "no such file", "/somewhere/else"), tmp_path)
 
 
 def test_one_run_at_a_time(tmp_path):
-    def second():
-        with results(tmp_path):
-            raise AssertionError
-
     with results(tmp_path) as stage:
         with pytest.raises(InputError, match="another mcc-jax run is writing there"):
-            second()
+            write(tmp_path, b="second")
         (stage.folder / "a").write_text("first")  # undisturbed by the refusal
     assert snapshot(tmp_path) == {"a": b"first"}
     with results(tmp_path):
@@ -147,8 +129,7 @@ def test_left_overs_of_a_killed_run_are_cleared(tmp_path):
     (tmp_path / LOCK).write_text("1\n")
     (tmp_path / WORK).mkdir()
     (tmp_path / WORK / "half").write_text("half")
-    with results(tmp_path) as stage:
-        (stage.folder / "a").write_text("a")
+    write(tmp_path, a="a")
     assert snapshot(tmp_path) == {"a": b"a"}
 
 
@@ -160,8 +141,7 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch, number):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
-    with results(tmp_path) as stage:
-        (stage.folder / "a").write_text("a")
+    write(tmp_path, a="a")
     assert snapshot(tmp_path) == {"a": b"a"}
 
 

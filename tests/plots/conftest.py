@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
@@ -41,42 +39,6 @@ def resampled(stresses, names=None, *, seed=0, points=100):
     return simulate_campaign(laws, diameters, peaks, programme, instrument=instrument, particles=names, seed=seed)
 
 
-def repeated(calibration, count):
-    """A calibration of so many particles, those of another over and over: nothing new to compile."""
-
-    def again(values):
-        return tuple(values[i % len(values)] for i in range(count))
-
-    campaign, adjustment = calibration.campaign, calibration.adjustment
-    index = np.arange(count) % len(campaign)
-    table = calibration.table
-    return replace(
-        calibration,
-        campaign=replace(
-            campaign,
-            particles=tuple(str(i + 1) for i in range(count)),
-            diameters_um=campaign.diameters_um[index],
-            curves=again(campaign.curves),
-            columns={},
-        ),
-        adjustment=replace(
-            adjustment,
-            curves=again(adjustment.curves),
-            shift=adjustment.shift[index],
-            reasons=again(adjustment.reasons),
-            segments=again(adjustment.segments),
-        ),
-        table=replace(
-            table,
-            strain=table.strain[index],
-            reached=table.reached[index],
-            flatness=table.flatness[index],
-            index=np.arange(count),
-        ),
-        particles=again(calibration.particles),
-    )
-
-
 @pytest.fixture(scope="session")
 def campaigns():
     cycles = Programme.cycles(levels=(0.3, 0.6, 1.0), unload_to=0.1, hold_s=20.0, interval_s=4.0)
@@ -89,14 +51,14 @@ def campaigns():
 
 
 class Calibrations(dict):
-    """Each campaign is calibrated where it is first asked for: every number of particles compiles anew."""
+    """Each campaign is calibrated where it is first asked for: every number of particles is compiled again."""
 
     def __init__(self, campaigns):
         super().__init__()
         self.campaigns = campaigns
 
     def __missing__(self, name):
-        found = repeated(self["paper"], 23) if name == "many" else calibrate_paper(self.campaigns[name])
+        found = calibrate_paper(self.campaigns[name])
         self[name] = found
         return found
 

@@ -32,7 +32,7 @@ from mcc_jax.plots import (
 from mcc_jax.plots.paper import adjusted_curve, dimensions, law_strain, stretches_outside
 from mcc_jax.plots.style import shape_factors
 
-KINDS = ["paper", "cycles", "two", "dropped", "many"]
+KINDS = ["paper", "cycles", "two", "dropped"]
 
 
 def line(ax, label):
@@ -73,10 +73,9 @@ def paper(calibrations):
 # ---- all figures -----------------------------------------------------------------------------------------------------
 
 
-def test_every_figure_is_written_as_png(saved, kind):
+def test_every_figure_is_written_as_png(saved):
     figures, files = saved
-    pages = {"many": ["particles", "particles_2"]}.get(kind, ["particles"])
-    assert list(figures) == ["curves", "dimensions", "collapse", "master", "law", *pages, "elastic", "residuals"]
+    assert list(figures) == ["curves", "dimensions", "collapse", "master", "law", "particles", "elastic", "residuals"]
     assert [f.name for f in files] == [f"{stem}.png" for stem in figures]
     assert sorted(files[0].parent.iterdir()) == sorted(files)
     for file, figure in zip(files, figures.values(), strict=True):
@@ -145,9 +144,8 @@ def test_curves_of_chosen_particles(calibrations):
 
 
 @pytest.mark.extended
-def test_many_curves_are_coloured_by_shape_factor(calibrations):
-    r = calibrations["many"]
-    figure = plot_curves(r, r.campaign.particles)
+def test_many_curves_are_coloured_by_shape_factor(paper):
+    figure = plot_curves(paper, paper.campaign.particles)
     assert [ax.get_ylabel() for ax in figure.axes if ax.get_label() == "<colorbar>"] == ["shape factor $\\eta_p$ [-]"]
 
 
@@ -252,15 +250,18 @@ def test_law_says_where_it_leaves_the_data(paper):
 
 
 @pytest.mark.extended
-def test_pages(calibrations):
-    assert [particle_pages(calibrations[k]) for k in (*calibrations.campaigns, "many")] == [1, 1, 1, 1, 2]
-    many = calibrations["many"]
-    assert [len(panels(plot_particles(many, page))) for page in (1, 2)] == [20, 3]
-    assert "Measured and predicted, page 2 of 2" in texts(plot_particles(many, 2))
-    assert any(t.startswith("particle 21\n") for t in texts(plot_particles(many, 2)))
+def test_pages(paper, monkeypatch):
+    assert particle_pages(paper) == 1
+    monkeypatch.setattr("mcc_jax.plots.curves.PAGE", 12)
+    assert particle_pages(paper) == 2
+    assert {"particles", "particles_2"} <= set(paper_figures(paper))
+    second = plot_particles(paper, 2)
+    assert len(panels(second)) == 8
+    assert second.get_suptitle() == "Measured and predicted, page 2 of 2"
+    assert any(t.startswith("particle 13\n") for t in texts(second))
     for page in (0, 3):
         with pytest.raises(ValueError, match=f"no page {page}; there are 2"):
-            plot_particles(many, page)
+            plot_particles(paper, page)
 
 
 def test_panels_show_measured_and_predicted(paper):

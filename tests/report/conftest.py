@@ -1,7 +1,7 @@
 import shutil
 
 import pytest
-from results_folder import stand_in, write_results
+from results_folder import changed, stand_in, write_results
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -30,3 +30,24 @@ def page(complete):
     from mcc_jax.report import read_results, report_page
 
     return report_page(read_results(complete, name="complete"))
+
+
+@pytest.fixture
+def without_posterior(folder):
+    """A folder in which predictions come from estimates alone."""
+    changed(folder, method="least-squares")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def results(complete):
+    from mcc_jax.report import read_results
+
+    return read_results(complete)
+
+
+@pytest.fixture(scope="session")
+def shown(results):
+    from mcc_jax.report.chart import compare
+
+    return compare(results)

@@ -243,3 +243,12 @@ def write_results(folder, names=NAMES):
     for stem in ("forest", "discovery_before_after"):
         (folder / "figures" / f"{stem}.png").write_bytes(PNG)
     return folder
+
+
+def changed(folder, name="calibration.msgpack", **changes):
+    """The results of a folder after changing one of its files."""
+    file = folder / name
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    from mcc_jax.report import read_results
+
+    return read_results(folder)
