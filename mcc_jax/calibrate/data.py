@@ -273,28 +273,24 @@ def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: 
     rows = np.arange(start, len(curve))
     if len(rows) <= most_points:
         return rows
+    most_parts = most_points // TURNS_SHARE
+    parts, thinned = segments, [rows[:: -(-len(rows) // most_points)]]
     turns = [int(np.argmax(curve.force_mN))]
-    if len(segments) <= most_points // TURNS_SHARE:
-        turns += [part.start for part in segments] + [part.stop - 1 for part in segments]
-        thinned = [rows[:: -(-len(rows) // most_points)]]
-    else:
-        elastic = [k for k, part in enumerate(segments) if part.kind in ("hold", "unload", "reload")]
-        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // TURNS_SHARE))]]
-        turns += [part.start for part in some] + [part.stop - 1 for part in some]
+    if len(segments) > most_parts:
+        elastic = [part for part in segments if part.kind in ("hold", "unload", "reload")]
+        parts = tuple(elastic[:: -(-len(elastic) // most_parts)])
         force = np.asarray(curve.force_mN)
         # The largest force before each, from which the law unloads.
         highest = np.maximum.accumulate(np.where(force >= np.maximum.accumulate(force), np.arange(len(force)), 0))
-        turns += [int(highest[part.start]) for part in some]
-        virgin = np.zeros(len(curve), bool)
-        for part in segments:
-            if part.kind == "load":
-                virgin[part.start : part.stop] = True
-        kept = np.zeros(len(curve), bool)
-        for part in some:
-            kept[part.start : part.stop] = True
+        turns += [int(highest[part.start]) for part in parts]
+        virgin, kept = (
+            np.concatenate([np.arange(0), *(np.arange(part.start, part.stop) for part in several)])
+            for several in ([part for part in segments if part.kind == "load"], parts)
+        )
         # Half of the rows for each: the one loading of many cycles is short.
-        parts = np.flatnonzero(virgin), np.flatnonzero(kept & ~virgin)
-        thinned = [part[part >= start][:: -(-len(part) * 2 // most_points) or 1] for part in parts]
+        shares = virgin[virgin >= start], np.setdiff1d(kept[kept >= start], virgin)
+        thinned = [some[:: -(-len(some) * 2 // most_points) or 1] for some in shares]
+    turns += [part.start for part in parts] + [part.stop - 1 for part in parts]
     return np.unique(np.concatenate([*thinned, [t for t in turns if t >= start]]).astype(int))
 
 

@@ -247,17 +247,13 @@ class _Fitter:
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
         before, N = self.point, len(self.tests)
-        expected = expect(free, target)
-        mean, latent, zero, theta = (
-            np.asarray(x)[:N] for x in (expected.mean, expected.latent, expected.zero, expected.theta)
-        )
-        sd, theta_mean, theta_sd = (np.asarray(x)[:N] for x in (expected.sd, expected.theta_mean, expected.theta_sd))
-        centre = np.column_stack([mean, self.zero_mean, theta_mean])
+        at = jax.tree.map(lambda x: np.asarray(x)[:N], expect(free, target))  # without padding
+        centre = np.column_stack([at.mean, self.zero_mean, at.theta_mean])
         zero_sd = np.full(N, self.model.chosen_priors.zero_um.sd)
-        width = np.column_stack([np.maximum(sd, NARROWEST), zero_sd, np.maximum(theta_sd, 1e-12)])
-        places = (before.latent, before.zero), (latent, zero), (mean, before.zero)
-        starts = np.stack([np.column_stack([*place, theta[:, self.varying]]) for place in places], 1)
-        return self.particles(self.white, centre, width, theta, starts).point
+        width = np.column_stack([np.maximum(at.sd, NARROWEST), zero_sd, np.maximum(at.theta_sd, 1e-12)])
+        places = (before.latent, before.zero), (at.latent, at.zero), (at.mean, before.zero)
+        starts = np.stack([np.column_stack([*place, at.theta[:, self.varying]]) for place in places], 1)
+        return self.particles(self.white, centre, width, at.theta, starts).point
 
     @property
     def zero_mean(self) -> np.ndarray:
@@ -342,7 +338,7 @@ def fit_tests(
         fitter.summarise()
         target = careful_enough(free, LogPosterior.of(model, fitter.marginal), count)
         free, covariance, mode_converged = most_probable(free, target)
-    alone = bool(np.all(np.asarray(fitter.individual.converged)))
+    alone = bool(np.all(fitter.individual.converged))
     return Fit(
         model,
         fitter.weighted,

@@ -175,17 +175,13 @@ def test_the_start_lands_near_the_truth(offset):
     assert np.all(np.abs(first[:, 4]) < 0.004 * np.asarray(reach))
 
 
-def test_the_start_of_a_particle_that_snaps_is_finite():
+def test_the_start_of_a_particle_that_snaps_and_of_an_impossible_record_is_finite():
     C = COEFFICIENTS.copy()
     C[1], C[2] = SNAPPING, SNAPPING * np.array([0.7, 1.0, 0.97])
     tests = select_tests(simulated(C, programme=CYCLES))
     for offset in (0.0, 0.03, -0.03):
         contact = tests.contact + offset * jnp.asarray(effective_diameter(DIAMETERS))
         assert np.all(np.isfinite(linear_starts(replace(tests, contact=contact), 9.0)))
-
-
-def test_the_start_of_an_impossible_record_is_finite():
-    tests = measured_with()
     for displaced in (-50.0, 0.0):
         measured = jnp.full_like(tests.displacement, displaced)
         assert np.all(np.isfinite(linear_starts(replace(tests, displacement=measured), 9.0)))
