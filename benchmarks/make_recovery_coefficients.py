@@ -1,4 +1,4 @@
-"""Write `mcc_jax/formulas/recovery_coefficients.py`.
+"""Print the coefficients in `mcc_jax/formulas/recovery.py`.
 
 Run `uv run --group test python benchmarks/make_recovery_coefficients.py`.
 
@@ -10,12 +10,9 @@ all analytic on [0, 1], then expanded in powers of z = 2u - 1 and z = 2w - 1. Ne
 digits that the cancellation in acos s - s sqrt(1 - s^2) needs.
 """
 
-from pathlib import Path
-
 from mpmath import mp, mpf
 
 mp.dps = 60
-TARGET = Path(__file__).parents[1] / "mcc_jax" / "law" / "recovery_coefficients.py"
 
 
 def ratio(u):
@@ -83,26 +80,24 @@ def largest_relative_error(function, coefficients):
     return worst
 
 
-def block(name, function, degree):
+def table(name, function, degree):
     coefficients = interpolate(function, degree)
     error = largest_relative_error(function, coefficients)
-    print(name, degree, mp.nstr(error, 3))
-    lines = "".join(f"    {float(c)!r},\n" for c in coefficients)
-    return f"# degree {degree}, largest relative error {mp.nstr(error, 2)}\n{name} = (\n{lines})\n"
+    numbers = [repr(float(c)) for c in coefficients]
+    rows = (", ".join(numbers[k : k + 4]) for k in range(0, len(numbers), 4))
+    lines = "".join(f"    {row},\n" for row in rows)
+    return f"{name} = (  # degree {degree}, largest relative error {mp.nstr(error, 2)}\n{lines})"
 
 
 def main():
-    script = "benchmarks/make_recovery_coefficients.py"
-    head = f'"""Coefficients of the recovery curve; written by `{script}`, not by hand."""\n\n'
-    blocks = [
-        block("RATIO_64", P, 17),
-        block("RATIO_32", P, 7),
-        block("ENERGY_64", R, 17),
-        block("RECOVERY_64", S, 23),
-        block("RECOVERY_32", S, 9),
-    ]
-    text = head + "".join(blocks)
-    TARGET.write_text(text, encoding="utf-8")
+    for name, function, degree in (
+        ("RATIO_64", P, 17),
+        ("RATIO_32", P, 7),
+        ("ENERGY_64", R, 17),
+        ("RECOVERY_64", S, 23),
+        ("RECOVERY_32", S, 9),
+    ):
+        print(table(name, function, degree))
 
 
 if __name__ == "__main__":

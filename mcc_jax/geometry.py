@@ -30,16 +30,14 @@ class Particle(eqx.Module):
     D1 and D2 are interchangeable: every quantity here is symmetric in them, to the last bit.
 
     Attributes:
-        D1: one diameter in the plane of the platens [um], > 0.
-        D2: the other diameter in that plane [um], > 0.
+        D1, D2: diameters in the plane of the platens [um], > 0.
         D3: diameter along the direction of compression [um], > 0.
 
     Raises:
-        InputError: for a diameter that is not positive and finite, where it can be looked at: not inside `jax.jit`.
+        InputError: for a diameter that is not positive and finite, where it has a value: not inside `jax.jit`.
 
     References:
-        Bommireddy et al. (2018), text below eq. 1; the paper's nomenclature calls D1 the major diameter, yet in its
-        Table 1 D1 < D2 for 12 of 20 particles.
+        Bommireddy et al. (2018), text below eq. 1 (in its Table 1 the major diameter is D1 or D2).
     """
 
     D1: Scalar = eqx.field(converter=_diameter)
@@ -106,20 +104,12 @@ class Particle(eqx.Module):
 
 
 def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
-    r"""Shape factor of plastic loading.
+    r"""Shape factor of plastic loading [-], 1 for a sphere (Bommireddy et al. 2018, eq. 13).
 
     .. math:: \eta_p = 1 + a \left(1 - \frac{D_3^2}{D_1 D_2}\right)
 
-    Args:
-        particle: the particle; :math:`\eta_p = 1` for a sphere, whatever `a`.
-        a: geometric parameter of the loading condition [-], 1.43 for Avicel PH-200; negative values are sensible
-            (dense bodies), but :math:`\eta_p` must stay positive for the law to carry stress.
-
-    Returns:
-        The shape factor [-].
-
-    References:
-        Bommireddy et al. (2018), eq. 13.
+    `a` is the geometric parameter of the loading condition [-], 1.43 for Avicel PH-200. Negative values are sensible
+    (dense bodies), but :math:`\eta_p` must stay positive for the law to carry stress.
     """
     finite(a, "the geometric parameter a")
     return _plastic_shape_factor(particle, scalar(a))
@@ -132,18 +122,12 @@ def _plastic_shape_factor(particle: Particle, a: Scalar) -> Scalar:
 
 @compiled_whole
 def elastic_shape_factor(particle: Particle) -> Scalar:
-    r"""Shape factor of the elastic (Hertz) contact, in closed form.
+    r"""Shape factor of the elastic (Hertz) contact [-] (Bommireddy et al. 2018, eq. 2, after Zheng et al. 2013).
 
     .. math:: 1/\eta_e = 1 - (r^{0.1368} - 1)^{1.531}, \qquad r = \max(D_1, D_2) / \min(D_1, D_2)
 
-    The paper prints :math:`D_1/D_2` for :math:`r`, which is not a number whenever :math:`D_1 < D_2`, as for 12 of its
-    own 20 particles. Against the exact elliptic contact of Hertz it is within 0.4 % up to r = 5.
-
-    Returns:
-        The shape factor [-], 1 at D1 = D2, where its first derivative is 0 (its second diverges).
-
-    References:
-        Bommireddy et al. (2018), eq. 2, after Zheng et al. (2013); made symmetric here.
+    The paper prints :math:`D_1/D_2` for :math:`r`, which is not a number whenever :math:`D_1 < D_2`. Against the exact
+    elliptic contact of Hertz it is within 0.4 % up to r = 5. At D1 = D2 it is 1, with first derivative 0.
     """
     # The modulus of a logarithm, not max/min: exactly symmetric, and at D1 = D2 no diameter wins the tie.
     log_ratio = jnp.abs(jnp.log(particle.D1) - jnp.log(particle.D2))

@@ -55,7 +55,6 @@ def examples(folder: Path) -> dict[str, Example]:
     programme = mcc.Programme.cycles()
     heights = np.linspace(2e-4, 1.9e-4, 3)
     packing = dem.spheres(the_law, [1e-4, 1.2e-4])
-    side = dem.half_contact(the_law, particle)
     return {
         "Particle": Example(mcc.Particle, D1=150.0, D2=130.0, D3=120.0),
         "Plastic": Example(mcc.Plastic, C1=7.0, C3=27.0, C5=140.0, signed=("C3",)),
@@ -122,8 +121,6 @@ def examples(folder: Path) -> dict[str, Example]:
         "Plane": Example(dem.Plane, point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), velocity=np.zeros(3)),
         "Cylinder": Example(dem.Cylinder, radius=1e-3, rim=2e-3, chamfer=1e-4, velocity=np.zeros(3), signed=("rim",)),
         "Solver": Example(dem.Solver, rtol=1e-10, max_steps=150, halvings=4, skin=0.5),
-        "pair_force": Example(dem.pair_force, i=side, j=side, overlap_max=1e-5, overlap=1e-5, signed=("overlap",)),
-        "wall_force": Example(dem.wall_force, side=side, overlap_max=1e-5, overlap=1e-5, signed=("overlap",)),
         "fit_compaction": Example(dem.fit_compaction, packing_of=lambda _: packing, start=np.ones(2), state=None,
             heights=heights, force=heights, run=False),
         "curve_tables": Example(export.curve_tables, law=the_law, strain_max=0.67, tolerance=1e-5, run=False),

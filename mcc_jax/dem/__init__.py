@@ -1,6 +1,7 @@
 """The law between particles: half contacts in series, history that survives neighbour lists, walls. SI units."""
 
 from .dynamics import Segment as Segment
+from .dynamics import Trajectory as Trajectory
 from .dynamics import advance as advance
 from .dynamics import in_single as in_single
 from .dynamics import replay as replay
@@ -15,17 +16,15 @@ from .forces import Forces as Forces
 from .forces import Interaction as Interaction
 from .forces import Motion as Motion
 from .forces import contact_forces as contact_forces
-from .measured import Trajectory as Trajectory
-from .packings import MCC_DENSITY as MCC_DENSITY
-from .packings import relative_density as relative_density
-from .packings import scattered as scattered
-from .packings import spheres as spheres
 from .pair import ContactEnergy as ContactEnergy
+from .pair import HalfContact as HalfContact
+from .pair import half_contact as half_contact
 from .pair import largest_overlap as largest_overlap
 from .pair import pair_energy as pair_energy
 from .pair import pair_force as pair_force
 from .pair import pair_recovery as pair_recovery
 from .pair import pair_split as pair_split
+from .pair import sides_of as sides_of
 from .pair import wall_energy as wall_energy
 from .pair import wall_force as wall_force
 from .pair import wall_recovery as wall_recovery
@@ -36,9 +35,7 @@ from .quasistatic import Solver as Solver
 from .quasistatic import compact as compact
 from .quasistatic import relaxed as relaxed
 from .quasistatic import replay_compaction as replay_compaction
-from .side import HalfContact as HalfContact
-from .side import half_contact as half_contact
-from .side import sides_of as sides_of
+from .state import MCC_DENSITY as MCC_DENSITY
 from .state import Packing as Packing
 from .state import State as State
 from .state import WallHistory as WallHistory
@@ -46,7 +43,10 @@ from .state import check_state as check_state
 from .state import load_state as load_state
 from .state import not_monotone as not_monotone
 from .state import rebuild_list as rebuild_list
+from .state import relative_density as relative_density
 from .state import save_state as save_state
+from .state import scattered as scattered
+from .state import spheres as spheres
 from .state import start as start
 from .uncertainty import STRESSES as STRESSES
 from .uncertainty import Band as Band

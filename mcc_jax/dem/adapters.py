@@ -11,13 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from .._errors import InputError
-from .._numerics import recompute
-from .edges import Edges, list_edges
-from .pair import largest_overlap, pair_energy, pair_force
-from .side import HalfContact, sides_of
+from .edges import Edges, list_edges, overlap_and_normal
+from .pair import HalfContact, largest_overlap, pair_energy, pair_force, sides_of
 
 
-def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dtype | type = np.float64) -> Edges:
+def edges_from_jaxmd(neighbours: Any, capacity: int | None = None) -> Edges:
     """Edges of virgin contacts from a `jax_md.partition.NeighborList`; give them history with `carry_history`.
 
     jax-md makes its lists for one cut-off: with spheres of several sizes take the largest sum of two radii.
@@ -25,7 +23,6 @@ def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dty
     Args:
         neighbours: a list of format OrderedSparse or Sparse (``pip install mcc-jax[jaxmd]``).
         capacity: length of the list of edges; that of jax-md's if None.
-        dtype: precision of the history.
 
     Raises:
         InputError: if the list is dense, or if it overflowed and so pairs are missing.
@@ -43,21 +40,18 @@ def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dty
             remedy="Allocate it again: `neighbours = neighbour_fn.allocate(position)`.",
         )
     pairs = index.T[(index < count).all(axis=0)]  # places not used name particle N
-    return list_edges(pairs, count, index.shape[1] if capacity is None else capacity, dtype)
+    return list_edges(pairs, count, index.shape[1] if capacity is None else capacity)
 
 
 def jaxdem_force_model(sides: HalfContact) -> Any:
     """A JaxDEM force model (`jaxdem.ForceModel`) that remembers the largest overlap of every contact.
 
     Use it with JaxDEM's `NeighborList` collider, which carries history and keeps the order of particles:
-    ``jaxdem.System.create(..., force_model=jaxdem_force_model(sides), collider_type="NeighborList", ...)``. Every
-    contact is computed from both sides with the same result, without torque, in metres and newtons.
+    ``jaxdem.System.create(..., force_model=jaxdem_force_model(packing.sides), collider_type="NeighborList", ...)``.
+    Every contact is computed from both sides with the same result, without torque, in metres and newtons.
 
     Written for the interface of JaxDEM in mid 2026 (`requires_history`, `init_history`, `force_and_history`). JaxDEM is
     not on the package index: install it from its source.
-
-    Args:
-        sides: half contacts, one a particle in the order of the JaxDEM state, as `Packing.sides`.
     """
     try:
         from jaxdem import ForceModel  # pyright: ignore[reportMissingImports]
@@ -84,23 +78,21 @@ def jaxdem_force_model(sides: HalfContact) -> Any:
         def force_and_history(i: Any, j: Any, pos: Array, state: Any, system: Any, history: Array) -> tuple:
             """Force on i from each j, no torque, and the largest overlaps after this one."""
             overlap, away, pair = _geometry(i, j, pos, state, system)
-            push = _each(pair_force, *pair, history, overlap)
+            push = _each(pair_force, *pair, history, overlap, axes=overlap.ndim)
             torque = jnp.zeros((*jnp.shape(overlap), *state.torque.shape[1:]), push.dtype)
-            return push[..., None] * away, torque, _each(largest_overlap, history, overlap)
+            return push[..., None] * away, torque, largest_overlap(history, overlap)
 
         @staticmethod
         def force(i: Any, j: Any, pos: Array, state: Any, system: Any) -> tuple:
             """Refused: without history there is no unloading."""
-            raise InputError(
-                "this collider of JaxDEM carries no history, and the law needs it",
-                remedy='Take `collider_type="NeighborList"`.',
-            )
+            problem = "this collider of JaxDEM carries no history, and the law needs it"
+            raise InputError(problem, remedy='Take `collider_type="NeighborList"`.')
 
         @staticmethod
         def energy(i: Any, j: Any, pos: Array, state: Any, system: Any) -> Array:
             """Energy that a contact loaded for the first time gives back; JaxDEM hands over no history here."""
             overlap, _, pair = _geometry(i, j, pos, state, system)
-            return _each(pair_energy, *pair, jnp.zeros_like(overlap), overlap).recoverable
+            return _each(pair_energy, *pair, jnp.zeros_like(overlap), overlap, axes=overlap.ndim).recoverable
 
     return MccForce(sides=sides)
 
@@ -111,20 +103,17 @@ def _geometry(
     """Overlaps, unit vectors from j to i, and the half contacts, those of the lower index first."""
     i, j = jnp.broadcast_arrays(i, j)
     between = system.domain.displacement(pos[i], pos[j], system)
-    square = jnp.sum(between * between, axis=-1)
-    apart = (i != j) & (square > 0)
-    distance = recompute(jnp.sqrt(jnp.where(apart, square, 1.0)))
-    overlap = jnp.where(apart, state.rad[i] + state.rad[j] - distance, -1.0)
-    away = jnp.where(apart[..., None], between * recompute(1 / distance)[..., None], 0.0)
+    reach = state.rad[i] + state.rad[j]
+    overlap, away = _each(overlap_and_normal, jnp.zeros_like(between), between, reach, i != j, axes=i.ndim)
     sides = _require(system.force_model.sides)
     return overlap, away, (sides_of(sides, jnp.minimum(i, j)), sides_of(sides, jnp.maximum(i, j)))
 
 
-def _each(law: Any, *arguments: Any) -> Any:
-    """The law for every contact of arrays of any shape, that of the last argument."""
-    for _ in range(arguments[-1].ndim):
+def _each(law: Any, *given: Any, axes: int) -> Any:
+    """The law for every contact of arrays with so many axes."""
+    for _ in range(axes):
         law = jax.vmap(law)
-    return law(*arguments)
+    return law(*given)
 
 
 def _require(sides: HalfContact | None) -> HalfContact:

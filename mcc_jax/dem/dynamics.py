@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .. import arguments
 from .._format import described
 from .._numerics import recompute
-from .._types import Scalar
 from .edges import stacked_lists, with_list
-from .forces import Forces, Motion, Vector, contact_forces
-from .measured import Sample, Trajectory, measured
+from .forces import Forces, Motion, contact_forces
 from .pair import wall_force, wall_recovery
 from .sharded import Contacts, Devices, gathered, sharded
-from .state import Packing, State, check_state, rebuild_list
-from .walls import set_velocity
+from .state import Packing, State, check_state, measured, rebuild_list
+from .walls import Walls, set_velocity
 
 Keep = Literal["steps", "lists"]
 
 
 class Segment(NamedTuple):
-    """A list of edges and for how many steps it was used: what `replay` needs. 16 B an edge."""
+    """A list of edges and for how many steps it was used: what `replay` needs."""
 
     key: Int[Array, " edges"]
     i: Int[Array, " edges"]
@@ -38,6 +36,29 @@ class Segment(NamedTuple):
     __repr__ = described()
 
 
+class Trajectory(NamedTuple):
+    """What was measured at the end of every chunk of steps, with one more axis in front.
+
+    Attributes:
+        on_wall: force on each wall [N], mean over the chunk's steps.
+        contacts: pairs and walls that carry force.
+        beyond_tested: contacts compressed further than the paper's tests (eta_p eps > 0.67), on either side.
+        kinetic: kinetic energy [J].
+        lists, capacity: neighbour lists made so far, and the length of the latest.
+    """
+
+    time: np.ndarray
+    walls: Walls
+    on_wall: np.ndarray
+    contacts: np.ndarray
+    beyond_tested: np.ndarray
+    kinetic: np.ndarray
+    lists: np.ndarray
+    capacity: np.ndarray
+
+    __repr__ = described(time="s", kinetic="J")
+
+
 def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = contact_forces) -> tuple[State, Forces]:
     """One step of the symplectic Euler rule (leapfrog): forces, then velocities, then positions and walls.
 
@@ -45,34 +66,22 @@ def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = co
     """
     forces, edges, history = contacts(packing, motion, state)
     dt = motion.time_step
-    velocity, spin = jax.vmap(_kicked, (None, 0, 0, 0, 0, 0, 0))(
-        motion, packing.mass, packing.radius, state.velocity, state.spin, forces.force, forces.torque
-    )
-    moved = State(
-        state.position + (dt * velocity).astype(state.position.dtype),
-        velocity,
-        spin,
-        edges,
-        history,
-        tuple(wall.moved(motion.time_step.astype(state.time.dtype)) for wall in state.walls),
-        state.listed_at,
-        state.skin,
-        state.time + dt.astype(state.time.dtype),
+    decay = recompute(1 / (1 + dt * motion.drag))
+    per_mass = recompute(1 / packing.mass)[:, None]
+    per_inertia = recompute(1 / (0.4 * packing.mass * packing.radius * packing.radius))[:, None]
+    velocity = decay * (state.velocity + dt * (forces.force * per_mass + motion.gravity[None]))
+    spin = decay * (state.spin + dt * forces.torque * per_inertia)
+    moved = replace(
+        state,
+        position=state.position + (dt * velocity).astype(state.position.dtype),
+        velocity=velocity,
+        spin=spin,
+        edges=edges,
+        wall_history=history,
+        walls=tuple(wall.moved(dt.astype(state.time.dtype)) for wall in state.walls),
+        time=state.time + dt.astype(state.time.dtype),
     )
     return moved, forces
-
-
-def _kicked(
-    motion: Motion, mass: Scalar, radius: Scalar, velocity: Vector, spin: Vector, force: Vector, torque: Vector
-) -> tuple[Vector, Vector]:
-    """Velocity and spin of one sphere after a step."""
-    dt = motion.time_step
-    decay = recompute(1 / (1 + dt * motion.drag))
-    inertia = 0.4 * mass * radius * radius
-    return (
-        decay * (velocity + dt * (force * recompute(1 / mass) + motion.gravity)),
-        decay * (spin + dt * torque * recompute(1 / inertia)),
-    )
 
 
 def run(
@@ -83,15 +92,9 @@ def run(
     wanted: Int[Array, ""] | int,
     devices: Devices | None = None,
 ) -> State:
-    """Steps on one list of edges, as one compiled loop, differentiable in both modes.
+    """Steps on one list of edges, as one compiled loop of so many steps, of which the first `wanted` are taken.
 
-    Args:
-        packing: the spheres.
-        motion: time step, damping and friction.
-        state: where to start.
-        steps: length of the loop.
-        wanted: how many of these steps are taken.
-        devices: over which the contacts are divided (`jax.devices()`); not divided if None.
+    Differentiable in both modes; contacts are divided over `devices` (`jax.devices()`) if there are any.
     """
     steps = arguments.whole(steps, "steps")
 
@@ -107,15 +110,13 @@ def run(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _run_while_listed(
-    devices: Devices | None, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""]
-) -> tuple[State, tuple[Int[Array, ""], Float[Array, "walls 3"]]]:
-    return sharded(_while_listed, devices, packing, motion, state, steps)
+def _run_while_listed(devices: Devices | None, *given: Any) -> tuple[State, tuple[Array, Array]]:
+    return sharded(_while_listed, devices, *given)
 
 
 def _while_listed(
     contacts: Contacts, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""]
-) -> tuple[State, tuple[Int[Array, ""], Float[Array, "walls 3"]]]:
+) -> tuple[State, tuple[Array, Array]]:
     """Steps for as long as the list is complete: no particle further than half the skin from where it was listed."""
 
     def list_valid(carry):
@@ -147,14 +148,12 @@ def advance(
     """Move on for a time, with a new list of edges whenever a particle has moved by half the skin.
 
     Args:
-        packing: the spheres.
-        motion: time step, damping and friction.
+        packing, motion: the spheres, and how they move.
         state: where to start.
         velocity: of each wall [m/s].
         rows: how often something is measured.
         steps: steps from one row to the next.
-        skin: extra distance up to which pairs are listed [m]; as large as a particle moves in a few tens of steps or
-            more, so that lists are made rarely.
+        skin: extra distance up to which pairs are listed [m]: as far as a particle moves in a few tens of steps.
         tape: a list to which the lists of edges are appended, for `replay`.
         devices: over which the contacts are divided, for example `jax.devices()`, those of all processes after
             `jax.distributed.initialize`; every process calls this with the same arguments. Not divided if None.
@@ -167,11 +166,11 @@ def advance(
     """
     rows, steps = arguments.whole(rows, "rows"), arguments.whole(steps, "steps")
     skin = arguments.number(skin, "skin [m]", least=0)
-    state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, velocity))
+    state = replace(state, walls=set_velocity(state.walls, velocity))
     made = 0
     if skin > float(state.skin):  # the list at hand may not hold all the pairs that the caller relies on
         state, made = rebuild_list(packing, state, skin), 1
-    table, lists, capacity = [], [], []
+    table = []
     for _ in range(rows):
         left, on_wall = steps, 0.0
         while left:
@@ -185,11 +184,9 @@ def advance(
                 state = rebuild_list(packing, state, skin)
                 made += 1
         check_state(state)
-        table.append(measured(packing, state, on_wall / steps))
-        lists.append(made)
-        capacity.append(state.edges.capacity)
-    columns: Sample = jax.tree.map(lambda *x: np.stack(x), *table)
-    return state, Trajectory(**columns._asdict(), lists=np.asarray(lists), capacity=np.asarray(capacity))
+        row = state.time, state.walls, on_wall / steps, *measured(packing, state), made, state.edges.capacity
+        table.append(Trajectory(*row))
+    return state, jax.tree.map(lambda *column: np.stack(column), *table)
 
 
 def replay(
@@ -206,13 +203,12 @@ def replay(
     are chaotic (see `compact`).
 
     Args:
-        packing: as in `advance`.
-        motion: as in `advance`.
+        packing, motion: as in `advance`.
         state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
         tape: of one call of `advance`.
         devices: as in `run`.
         keep: what reverse mode keeps on its way: the states of all steps, or, for long motions, those between lists
-            only; each step is then computed once more.
+            only; each step is then computed again.
     """
     arguments.choice(keep, get_args(Keep), "keep")
     if not tape:
@@ -221,11 +217,11 @@ def replay(
     segments = stacked_lists(tape)
 
     def one(state: State, segment: Segment) -> tuple[State, None]:
-        state = eqx.tree_at(lambda s: s.edges, state, with_list(state.edges, segment.key, segment.i, segment.j))
+        state = replace(state, edges=with_list(state.edges, segment.key, segment.i, segment.j))
         return run(packing, motion, state, longest, segment.steps, devices), None
 
     first = with_list(state.edges, segments.key[0], segments.i[0], segments.j[0])  # as long as all others
-    state = eqx.tree_at(lambda s: s.edges, state, first)
+    state = replace(state, edges=first)
     return jax.lax.scan(jax.checkpoint(one) if keep == "lists" else one, state, segments)[0]
 
 
@@ -253,11 +249,8 @@ def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, 
     by about 1e-6 of the largest (tested to 1e-5). History takes 16 B an edge instead of 32.
     """
 
-    def fields(state: State) -> tuple[Any, ...]:
-        return state.velocity, state.spin, state.edges, state.wall_history
+    def single(tree: Any) -> Any:
+        return jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
-    return _single(packing), _single(motion), eqx.tree_at(fields, state, _single(fields(state)))
-
-
-def _single(tree: Any) -> Any:
-    return jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+    history = {name: single(getattr(state, name)) for name in ("velocity", "spin", "edges", "wall_history")}
+    return single(packing), single(motion), replace(state, **history)

@@ -14,7 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from .._types import Flag
+from .._numerics import recompute
+from .._types import Flag, Scalar
+from .walls import Vector, dot
 
 PADDING = np.iinfo(np.int64).max
 """Key of a place in the list that no pair uses; sorts behind all others."""
@@ -27,7 +29,7 @@ class Edges(eqx.Module):
     key. A pair that leaves the list loses its history: should it come back, it is a virgin contact.
 
     Attributes:
-        key: keys, ascending, then padding. 8 B an edge; needs double precision switched on, the rest does not.
+        key: keys, ascending, then padding; they need double precision switched on.
         i, j: particles of the pair, i < j; 0 in padding.
         overlap_max: largest overlap so far [m].
         slip: elastic tangential displacement of j's surface against i's [m].
@@ -60,36 +62,44 @@ class Edges(eqx.Module):
         """Whether the list is too short and pairs were left out."""
         return self.wanted > self.capacity
 
-    def require_room(self) -> None:
-        """Refuse to go on with a list from which pairs are missing."""
-        if bool(self.overflow):
-            raise InputError(
-                f"{int(self.wanted)} pairs do not fit into a list of {self.capacity} edges",
-                remedy="Make the list with a larger `capacity`; nothing was computed with this one.",
-            )
+
+def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tuple[Scalar, Vector]:
+    """Overlap [m] of two spheres and unit vector from i to j, from centres [m] and the sum of the radii [m].
+
+    Coincident centres: zero normal, no force. Unused places of the list: overlap -1 m. A position that is NaN shows.
+    The overlap, a small difference of large numbers, is taken in the precision of the positions and then rounded.
+    """
+    between = j - i
+    square = dot(between, between)
+    apart = listed & (square > 0)
+    distance = recompute(jnp.sqrt(jnp.where(apart, square, 1.0)))
+    separation = reach.astype(distance.dtype) - distance
+    overlap = jnp.where(apart, separation, jnp.where(listed & jnp.isnan(square), square, -1.0))
+    normal = jnp.where(apart, between * recompute(1 / distance), 0.0)
+    return overlap.astype(reach.dtype), normal.astype(reach.dtype)
+
+
+def pair_geometry(
+    radius: Float[Array, " particles"], position: Float[Array, "particles 3"], edges: Edges
+) -> tuple[Array, Array]:
+    """Overlap [m] and unit normal from i to j of every edge."""
+    i, j = edges.i, edges.j
+    return jax.vmap(overlap_and_normal)(position[i], position[j], radius[i] + radius[j], edges.active)
 
 
 def close_pairs(position: Any, radius: Any, skin: float) -> Int[np.ndarray, "pairs 2"]:
-    """All pairs whose surfaces are closer than the skin, :math:`|x_i - x_j| < R_i + R_j + s`.
+    """All pairs whose surfaces are closer than the skin, :math:`|x_i - x_j| < R_i + R_j + s` [m].
 
-    By `vesin` if it is installed (``pip install mcc-jax[neighbours]``), else by SciPy's k-d tree; the same pairs.
-
-    Args:
-        position: centres [m].
-        radius: radii [m].
-        skin: extra distance [m]. No pair can touch unseen until a particle has moved by half of it.
-
-    Raises:
-        InputError: if a position is not finite; it names the particle.
+    By `vesin` if it is installed (``pip install mcc-jax[neighbours]``), else by SciPy's k-d tree; the same pairs. None
+    can touch unseen until a particle has moved by half of the skin. `InputError` names a position that is not finite.
     """
     position = arguments.floats(position, "position", shape="centres [m], shape (N, 3)")
     radius = arguments.floats(radius, "radius", shape="radii [m], shape (N,)")
-    if position.ndim != 2 or position.shape[1] != 3 or radius.ndim != 1:
+    skin = arguments.number(skin, "skin [m]", least=0)
+    arguments.positive(radius, "radius [m]")
+    if position.shape != (*radius.shape, 3):
         shapes = f"{position.shape} and {radius.shape}"
         raise InputError(f"position and radius have the shapes {shapes} where (N, 3) and (N,) are expected")
-    arguments.same_length(position=position, radius=radius)
-    arguments.positive(radius, "radius [m]")
-    skin = arguments.number(skin, "skin [m]", least=0)
     lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if lost.size:
         raise InputError(
@@ -119,13 +129,9 @@ def _pairs_within(position: np.ndarray, cutoff: float) -> np.ndarray:
 
 
 def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type = np.float64) -> Edges:
-    """Edges of virgin contacts from pairs in any order.
+    """Edges of virgin contacts from pairs of indices, shape (pairs, 2), in any order; repetitions are dropped.
 
-    Args:
-        pairs: indices of particles; the order of pairs and within a pair does not matter, repetitions are dropped.
-        particles: number of particles N.
-        capacity: length of the list. If the pairs do not fit, `Edges.overflow` says so.
-        dtype: precision of the history.
+    The list has the length `capacity`; if the pairs do not fit, `Edges.overflow` is true.
 
     Raises:
         InputError: if an index is not of a particle, a particle is paired with itself, or without double precision.
@@ -135,30 +141,17 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
             "keys of contacts need 64 bits",
             remedy='jax.config.update("jax_enable_x64", True) first; positions and forces may still be float32.',
         )
-    particles = arguments.whole(particles, "particles")
-    capacity = arguments.whole(capacity, "capacity")
-    given = np.asarray(pairs)
-    if given.size and (given.dtype.kind not in "iu" or given.ndim != 2 or given.shape[1] != 2):
-        raise InputError(f"pairs must be pairs of whole numbers, shape (pairs, 2), got {arguments.shown(pairs)}")
-    pairs = given.astype(np.int64).reshape(-1, 2)
+    pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
     low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
     wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))
     if wrong.size:
         raise InputError(f"pair {wrong[0]} joins {pairs[wrong[0]].tolist()}", remedy=f"Name two of {particles}.")
-    key = np.sort(low * particles + high)
-    key = key[np.diff(key, prepend=-1) > 0]
+    key = np.unique(low * particles + high)
     kept = np.full(capacity, PADDING)
     kept[: min(key.size, capacity)] = key[:capacity]
-    first, second = np.divmod(np.where(kept == PADDING, 0, kept), particles)
-    return Edges(
-        jnp.asarray(kept),
-        jnp.asarray(first, jnp.int32),
-        jnp.asarray(second, jnp.int32),
-        jnp.zeros(capacity, dtype),
-        jnp.zeros((capacity, 3), dtype),
-        jnp.asarray(key.size),
-        particles,
-    )
+    i, j = (jnp.asarray(x, jnp.int32) for x in np.divmod(np.where(kept == PADDING, 0, kept), particles))
+    history = jnp.zeros(capacity, dtype), jnp.zeros((capacity, 3), dtype)
+    return Edges(jnp.asarray(kept), i, j, *history, jnp.asarray(key.size), particles)
 
 
 @jax.jit
@@ -179,18 +172,13 @@ def with_list(old: Edges, key: Array, i: Array, j: Array) -> Edges:
 def stacked_lists[Recorded: Any](tape: Sequence[Recorded]) -> Recorded:
     """Named tuples with a list of edges each (`key`, `i`, `j`) as one with a leading axis, padded to one length."""
     longest = max(step.key.shape[0] for step in tape)
+    padded = []
+    for step in tape:
+        key, i, j = pad_rows(step.key, longest, PADDING), pad_rows(step.i, longest), pad_rows(step.j, longest)
+        padded.append(step._replace(key=key, i=i, j=j))
+    return type(tape[0])(*(jnp.asarray(np.stack(column)) for column in zip(*padded, strict=True)))
 
-    def padded(step: Recorded) -> Recorded:
-        i, j = pad_rows((step.i, step.j), longest)
-        return step._replace(key=pad_rows(step.key, longest, PADDING), i=i, j=j)
 
-    return type(tape[0])(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
-
-
-def pad_rows(tree: Any, rows: int, value: int = 0) -> Any:
-    """The arrays of a tree with so many rows, the new ones filled with a value."""
-
-    def longer(x: Array) -> Array:
-        return jnp.pad(x, [(0, rows - len(x)), *[(0, 0)] * (x.ndim - 1)], constant_values=value)
-
-    return jax.tree.map(longer, tree)
+def pad_rows(x: Array, rows: int, value: int = 0) -> Array:
+    """An array with so many rows, the new ones filled with a value."""
+    return jnp.pad(x, [(0, rows - len(x)), *[(0, 0)] * (x.ndim - 1)], constant_values=value)

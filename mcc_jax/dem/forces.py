@@ -7,31 +7,20 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .. import arguments
-from .._errors import InputError
 from .._format import described
 from .._numerics import recompute
 from .._types import Flag, Scalar, ScalarLike, scalar
-from .edges import Edges
-from .pair import largest_overlap, pair_force, wall_force
-from .side import HalfContact
+from .edges import Edges, overlap_and_normal
+from .pair import HalfContact, largest_overlap, pair_force, wall_force
 from .state import Packing, State, Vectors, WallHistory
-from .walls import Wall, Walls, dot
-
-Vector = Float[Array, " 3"]
+from .walls import Vector, Wall, Walls, dot
 
 
-def _share(value: ScalarLike) -> Scalar:
-    arguments.positive(value, "damping or tangential_ratio [-]", zero=True, plain=True)
-    return scalar(value)
-
-
-def _friction(value: ScalarLike | None) -> Scalar | None:
-    arguments.positive(0.0 if value is None else value, "friction or wall_friction [-]", zero=True, plain=True)
+def _share(value: ScalarLike | None) -> Scalar | None:
+    arguments.positive(0.0 if value is None else value, "a number of an interaction [-]", zero=True, plain=True)
     return None if value is None else scalar(value)
 
 
@@ -53,21 +42,17 @@ class Interaction(eqx.Module):
     """
 
     damping: Scalar = eqx.field(converter=_share, default=0.0)
-    friction: Scalar | None = eqx.field(converter=_friction, default=None)
-    wall_friction: Scalar | None = eqx.field(converter=_friction, default=None)
+    friction: Scalar | None = eqx.field(converter=_share, default=None)
+    wall_friction: Scalar | None = eqx.field(converter=_share, default=None)
     tangential_ratio: Scalar = eqx.field(converter=_share, default=0.8)
 
     __repr__ = described()
 
 
 class Motion(eqx.Module):
-    """How the packing moves.
+    """How the packing moves: time step [s] (`stable_time_step`), damping and friction, drag, gravity [m/s^2].
 
-    Attributes:
-        time_step: [s]; see `stable_time_step`.
-        interaction: damping and friction of contacts.
-        drag: rate at which all velocities decay [1/s]; a way to a quasi-static state, not physics.
-        gravity: acceleration [m/s^2].
+    Drag is the rate at which all velocities decay [1/s]: a way to a quasi-static state, not physics.
     """
 
     time_step: Scalar
@@ -84,26 +69,16 @@ class Motion(eqx.Module):
         interaction: Interaction | None = None,
         drag: float = 0.0,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
-        dtype: DTypeLike = jnp.float64,
     ) -> Motion:
-        """From plain numbers."""
+        """From plain numbers, in double precision."""
         time_step = arguments.number(time_step, "the time step [s], see `stable_time_step`,", above=0)
         drag = arguments.number(drag, "drag [1/s]", least=0)
-        acceleration = arguments.floats(gravity, "gravity", shape="three components [m/s^2]")
-        if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
-            raise InputError(f"gravity must be three finite components [m/s^2], got {arguments.shown(gravity)}")
-        given = jax.tree.map(lambda x: x.astype(dtype), interaction or Interaction())
-        return cls(jnp.asarray(time_step, dtype), given, jnp.asarray(drag, dtype), jnp.asarray(acceleration, dtype))
+        step, resistance, weight = (jnp.asarray(x, float) for x in (time_step, drag, gravity))
+        return cls(step, interaction or Interaction(), resistance, weight)
 
 
 class Forces(eqx.Module):
-    """Forces of all contacts.
-
-    Attributes:
-        force: on each particle [N].
-        torque: on each particle about its centre [N m].
-        on_wall: on each wall [N].
-    """
+    """Force [N] and torque [N m] on each particle about its centre, and force on each wall [N]."""
 
     force: Vectors
     torque: Vectors
@@ -128,24 +103,8 @@ class _Contact(eqx.Module):
 
     force: Vector
     moment: Vector
-    overlap_max: Scalar
     slip: Vector
-
-
-def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tuple[Scalar, Vector]:
-    """Overlap [m] of two spheres and unit vector from i to j, from centres [m] and the sum of the radii [m].
-
-    Coincident centres: zero normal, no force. Unused places of the list: overlap -1 m. A position that is NaN shows.
-    The overlap, a small difference of large numbers, is taken in the precision of the positions and then rounded.
-    """
-    between = j - i
-    square = dot(between, between)
-    apart = listed & (square > 0)
-    distance = recompute(jnp.sqrt(jnp.where(apart, square, 1.0)))
-    separation = reach.astype(distance.dtype) - distance
-    overlap = jnp.where(apart, separation, jnp.where(listed & jnp.isnan(square), square, -1.0))
-    normal = jnp.where(apart, between * recompute(1 / distance), 0.0)
-    return overlap.astype(reach.dtype), normal.astype(reach.dtype)
+    overlap_max: Scalar
 
 
 def contact_forces(packing: Packing, motion: Motion, state: State) -> tuple[Forces, Edges, WallHistory]:
@@ -209,7 +168,8 @@ def _between(motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scal
     elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
     k = recompute(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
     mass = recompute(i.mass * j.mass / (i.mass + j.mass))
-    return _contact(motion, friction, elastic, k, mass, normal, relative, overlap_max, overlap, slip)
+    loaded = _contact(motion, friction, elastic, k, mass, normal, relative, slip)
+    return _Contact(*loaded, largest_overlap(overlap_max, overlap))
 
 
 def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> _Contact:
@@ -220,8 +180,8 @@ def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip:
     if friction is not None:
         relative = relative - jnp.cross(body.radius * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
-    k, mass = body.side.k1, body.mass
-    return _contact(motion, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip)
+    loaded = _contact(motion, friction, elastic, body.side.k1, body.mass, outward, relative, slip)
+    return _Contact(*loaded, largest_overlap(overlap_max, overlap))
 
 
 def _contact(
@@ -232,19 +192,19 @@ def _contact(
     mass: Scalar,
     normal: Vector,
     relative: Vector,
-    overlap_max: Scalar,
-    overlap: Scalar,
     slip: Vector,
-) -> _Contact:
-    """Force on the first body; the normal points from it to the second, whose surface moves relative to its own."""
+) -> tuple[Vector, Vector, Vector]:
+    """Force on the first body, its moment per unit arm, and slip.
+
+    The normal points to the second body, whose surface moves relative to that of the first.
+    """
     opening = dot(relative, normal)
     touching = elastic > 0
     damping = 2 * motion.interaction.damping
     push = elastic - damping * recompute(jnp.sqrt(mass * k)) * opening
     push = jnp.where(touching & (push > 0), push, jnp.where(jnp.isnan(elastic), elastic, 0.0))
-    overlap_max = largest_overlap(overlap_max, overlap)
     if friction is None:
-        return _Contact(-push * normal, jnp.zeros_like(normal), overlap_max, slip)
+        return -push * normal, jnp.zeros_like(normal), slip
 
     # The contact plane turned since the last step: keep the slip's length and put it into the new plane.
     sliding = relative - opening * normal
@@ -261,9 +221,7 @@ def _contact(
     tangential = trial * jnp.where(slips, recompute(limit / jnp.where(slips, size, 1.0)), 1.0)
     tangential = jax.lax.optimization_barrier(tangential)
     held = jnp.where(slips, tangential * recompute(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
-    return _Contact(
-        tangential - push * normal, jnp.cross(normal, tangential), overlap_max, jnp.where(touching, held, 0.0)
-    )
+    return tangential - push * normal, jnp.cross(normal, tangential), jnp.where(touching, held, 0.0)
 
 
 def _norm(vector: Vector) -> Scalar:

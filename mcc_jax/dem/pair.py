@@ -1,41 +1,135 @@
-"""Two half contacts in series: equal force, one history scalar, derivatives in closed form."""
+"""The law between particles: half contacts, two of them in series, and one against a rigid wall."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._numerics import recompute
-from .._types import Scalar, ScalarLike
-from ..formulas import Contact, stored, stress_ratio
+from .._types import Flag, Scalar, ScalarLike, Values
+from ..effects import AbstractModulusAtPeak
+from ..formulas import Contact, first_gain, stored, stress_ratio
 from ..formulas.contact import Recovered, falling
-from ..formulas.loading_inverse import quintic
-from .side import HalfContact
+from ..geometry import Particle
+from ..law import TESTED_STRAIN, MccLaw
+from ..law.response import factor_at_peak, folded
 
+AREA = 1e6 * jnp.pi
+"""Area over R_e^2, times what makes N of MPa m^2."""
 SPLIT_STEPS = 2
-"""Enough between particles of one law and radii from 80 to 120 um, with one more step on both sides.
-
-Contacts that need more get more, 8 for radii from 20 to 150 um and the paper's scatter; only their batch waits.
-"""
+"""Enough for one law and radii from 80 to 120 um; a batch with contacts that need more goes on until all are done."""
 SPLIT_STEPS_AT_MOST = 200
 """A bracket is halved down to the last digit in fewer."""
 
 
-class ContactEnergy(eqx.Module):
-    """Energy balance of a contact [J]: work done on it = recoverable + dissipated.
+class HalfContact(Contact):
+    r"""Half of a plate test: force against the compression d of one side of a particle, towards a rigid flat.
+
+    A `formulas.Contact` in metres and newtons. A particle between two plates is two half contacts in series, each
+    compressed by half the platen displacement. Make many with ``jax.vmap(half_contact)``, pick with `sides_of`.
 
     Attributes:
-        recoverable: what it gives back on full release.
-        dissipated: what is lost for good; does not change while unloading and reloading.
+        k1, k3, k5: initial stiffness [N/m], softening [N/m^3], hardening [N/m^5].
+        c: factor of the recovered compression squared, [m^3/N] for n = 1 and [m^3/N^2] for n = 2.
+        tested: compression at which the paper's tests ended, eta_p eps = 0.67 [m]; beyond it the law extrapolates.
+        power: n, 1 for the printed unloading form and 2 for the punch forms.
+        effects: those on the modulus at a peak (damage, densification).
+        radius: of curvature R_e [m], where there are such effects: strain is d / R_e, stress F / (pi R_e^2).
     """
+
+    tested: Scalar
+    effects: tuple[AbstractModulusAtPeak, ...] = ()
+    radius: Scalar | None = None
+
+    __repr__ = described()
+
+    def at_peak(self, d: Values) -> Contact:
+        """The contact that unloads from a peak compression [m]: the effects' factor on the modulus is part of c.
+
+        Beyond the tested compression the factor stays as it is there: the recovery limit alone then keeps a contact
+        from gaining energy.
+        """
+        if self.radius is None:
+            return self.bare
+        d = jnp.where(d < self.tested, jnp.where(d > 0, d, 0.0), self.tested)
+        stress = self.loading(d) / (AREA * self.radius * self.radius)
+        return self.softened(factor_at_peak(self.effects, d / self.radius, stress))
+
+    @property
+    def is_passive(self) -> Flag:
+        """Whether the energy it loses grows with its peak, so that no path gains energy. True without effects."""
+        return jnp.isinf(first_gain(self.at_peak, self.tested)) if self.effects else jnp.asarray(True)
+
+    @property
+    def is_valid(self) -> Flag:
+        """Whether stiffness, hardening and recovery are positive, nothing is NaN, and it `is_passive`."""
+        return (self.k1 > 0) & (self.k3 >= 0) & (self.k5 > 0) & (self.c > 0) & (self.tested > 0) & self.is_passive
+
+
+def sides_of(sides: HalfContact, index: Int[Array | np.ndarray, " contacts"]) -> HalfContact:
+    """The half contacts of the particles at an index, from a batch with one for each particle."""
+    return jax.tree.map(lambda x: x[index], sides)
+
+
+def passive(sides: HalfContact) -> HalfContact:
+    """The half contacts, one or a batch, if no path of theirs gains energy; traced ones pass."""
+    if not sides.effects or arguments.is_traced(jax.tree.leaves(sides)):
+        return sides
+    if not jnp.all(jax.vmap(lambda one: one.is_passive)(sides) if sides.k1.ndim else sides.is_passive):
+        names = ", ".join(effect.name for effect in sides.effects)
+        problem = f"with {names} a contact would give back more energy than it took"
+        raise InputError(problem, remedy="Take a smaller amplitude, or a stiffer effective modulus.")
+    return sides
+
+
+def half_contact(law: MccLaw, particle: Particle, normal: Float[Array, " 3"] | None = None) -> HalfContact:
+    r"""Half contact of a particle in a direction, in SI units.
+
+    .. math::
+        h(n) = \sqrt{a^2 n_1^2 + b^2 n_2^2 + c^2 n_3^2}, \quad R_e(n) = abc / h^2, \quad
+        \eta_p(n) = 1 + a_s (1 - h / R_e)
+
+    .. math:: F(d) = \pi R_e^2\, \sigma(\eta_p d / R_e), \qquad \Delta = R_e\, \delta(\eta_p, d_P / R_e)
+
+    with the semi-axes a, b, c = D1/2, D2/2, D3/2, and :math:`\sigma, \delta` of the law (its `a` is :math:`a_s`). R_e
+    is the radius of Gaussian curvature of the ellipsoid where its tangent plane has that normal. Along e3 this is the
+    paper's particle exactly; in other directions it is a generalisation of our own that no test supports yet.
+
+    Effects on parameters (size, shape) take the particle as it is tested, along D3; those on the modulus take strain
+    and stress of this side at its own peak.
+
+    Args:
+        law: the particle's own law; particles of one pair may differ in all of it but the unloading form.
+        particle: its diameters [um].
+        normal: unit vector in the frame of the particle's axes; e3 if None.
+
+    Raises:
+        InputError: naming an effect that is no closed formula (`AbstractEffect.closed`), or by which it gains energy.
+
+    References:
+        Bommireddy et al. (2018), eqs. 3 to 5, 13, 16 and 24, for e3.
+    """
+    semi = 0.5e-6 * jnp.stack([particle.D1, particle.D2, particle.D3])  # m
+    square = semi[2] * semi[2] if normal is None else jnp.sum((semi * normal) ** 2)
+    radius = recompute(jnp.prod(semi) / square)
+    formulas, at_peak = folded(law, law.effects, particle, "the half contact")
+    eta = 1 + formulas.a * (1 - recompute(jnp.sqrt(square)) / radius)
+    contact = formulas.contact_of_size(AREA, eta, radius, recompute(1 / radius))
+    tested = recompute(TESTED_STRAIN * radius / eta)
+    numbers = contact.k1, contact.k3, contact.k5, contact.c, tested, at_peak, radius if at_peak else None
+    return passive(HalfContact(*numbers, power=contact.power))
+
+
+class ContactEnergy(eqx.Module):
+    """Energy balance of a contact [J]: work done on it is what it gives back on full release and what is lost."""
 
     recoverable: Scalar
     dissipated: Scalar
@@ -43,12 +137,8 @@ class ContactEnergy(eqx.Module):
     __repr__ = described(recoverable="J", dissipated="J")
 
 
-def largest_overlap(overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
+def largest_overlap(overlap_max: Values | float, overlap: Values | float) -> Values:
     """The history after this overlap [m]: the larger of both; an overlap that is NaN shows."""
-    return _larger(*(arguments.values(x, "an overlap [m]") for x in (overlap_max, overlap)))
-
-
-def _larger(overlap_max: Scalar, overlap: Scalar) -> Scalar:
     return jnp.where(overlap < overlap_max, overlap_max, overlap)
 
 
@@ -61,57 +151,50 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
 
     with f of `law.stress_ratio`. The equal-force split is unique where both sides are monotone. Both sides peaked at
     the same force, so they unload by the same share of it, and the largest overlap is all there is to remember. Each
-    side recovers no more than its own limit; next to a side that does not give way on loading the other behaves as
-    against a wall. Value and first derivatives, in both modes, are finite everywhere; at the onset of unloading the
-    derivative is that of loading.
+    side recovers no more than its own limit. Value and first derivatives, in both modes, are finite everywhere; at the
+    onset of unloading the derivative is that of loading.
 
     Args:
-        i: one half contact.
-        j: the other; exchanging them changes nothing but rounding.
+        i, j: the half contacts; exchanging them changes nothing but rounding.
         overlap_max: largest overlap before this one [m], 0 for a virgin contact.
         overlap: overlap now [m]; negative where the particles do not touch.
 
     Raises:
         InputError: if one side unloads by the printed form and the other by a punch form.
     """
-    overlap_max, overlap = _numbers(overlap_max, overlap, i)
     if i.power != j.power:
         raise InputError(
             "a pair whose sides unload by different forms shares no unloading curve",
             remedy="Give both particles the same `unloading` form.",
         )
-    peak = _larger(overlap_max, overlap)
+    peak, drop = _peak_and_drop(i, overlap_max, overlap)
     if not (i.effects or j.effects):
-        return _series_force(i.at_peak(peak), j.at_peak(peak), peak, peak - overlap)
+        return _series_force(i.bare, j.bare, peak, drop)
     series = _series(i.bare, j.bare, peak)  # XLA solves the split once, for here and for the force
-    return _series_force(i.at_peak(series.d_i), j.at_peak(series.d_j), peak, peak - overlap)
+    return _series_force(i.at_peak(series.d_i), j.at_peak(series.d_j), peak, drop)
 
 
 def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
     r"""Force [N] of a rigid wall on a particle: the half contact alone, :math:`F = F_P f((d_P - d) / \Delta)`."""
-    overlap_max, overlap = _numbers(overlap_max, overlap, side)
-    peak = _larger(overlap_max, overlap)
-    return side.at_peak(peak).force(peak, peak - overlap)
+    peak, drop = _peak_and_drop(side, overlap_max, overlap)
+    return side.at_peak(peak).force(peak, drop)
 
 
 def pair_split(i: HalfContact, j: HalfContact, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
     """Compressions [m] of the two sides while loading at an overlap [m], and so of the peak of any unloading."""
-    series = _series(i.bare, j.bare, _numbers(0.0, overlap, i)[1])
+    series = _series(i.bare, j.bare, _peak_and_drop(i, 0.0, overlap)[0])
     return series.d_i, series.d_j
 
 
 def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: ScalarLike) -> Scalar:
-    r"""Overlap [m] given back on full release, :math:`\Delta_i + \Delta_j`; arguments as in `pair_force`.
-
-    It is 1 where no force was carried.
-    """
-    overlap_max, _ = _numbers(overlap_max, 0.0, i)
-    return _recovered(i, j, _series(i.bare, j.bare, overlap_max))
+    r"""Overlap [m] given back on full release, :math:`\Delta_i + \Delta_j`; 1 where no force was carried."""
+    peak, _ = _peak_and_drop(i, overlap_max, overlap_max)
+    return _recovered(i, j, _series(i.bare, j.bare, peak))
 
 
 def wall_recovery(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
     r"""Overlap [m] that a rigid wall is given back, :math:`\Delta`; see `pair_recovery`."""
-    peak, _ = _numbers(overlap_max, 0.0, side)
+    peak, _ = _peak_and_drop(side, overlap_max, overlap_max)
     return side.at_peak(peak).recovered(peak).span
 
 
@@ -121,32 +204,26 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap
     .. math:: W = \sum_s \left(\tfrac12 k_1 d^2 - \tfrac14 k_3 d^4 + \tfrac16 k_5 d^6\right)_s, \quad
         W_{rec} = F_P (\Delta_i + \Delta_j)\, g(q), \quad W_{diss} = W - W_{rec}(q = 0)
 
-    with g of `law.energy_ratio`. Arguments as in `pair_force`.
+    with g of `law.energy_ratio`.
     """
-    overlap_max, overlap = _numbers(overlap_max, overlap, i)
-    peak = _larger(overlap_max, overlap)
+    peak, drop = _peak_and_drop(i, overlap_max, overlap)
     series = _series(i.bare, j.bare, peak)
-    at_peak, now = stored(series.force, _recovered(i, j, series), peak - overlap)
+    at_peak, now = stored(series.force, _recovered(i, j, series), drop)
     return ContactEnergy(now, i.work(series.d_i) + j.work(series.d_j) - at_peak)
 
 
 def wall_energy(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> ContactEnergy:
     """Energy [J] of a contact with a rigid wall; see `pair_energy`."""
-    overlap_max, overlap = _numbers(overlap_max, overlap, side)
-    peak = _larger(overlap_max, overlap)
-    at_peak, now = side.at_peak(peak).stored(peak, peak - overlap)
+    peak, drop = _peak_and_drop(side, overlap_max, overlap)
+    at_peak, now = side.at_peak(peak).stored(peak, drop)
     return ContactEnergy(now, side.work(peak) - at_peak)
 
 
-def _numbers(overlap_max: ScalarLike, overlap: ScalarLike, side: HalfContact) -> tuple[Scalar, Scalar]:
-    """Both overlaps as arrays, plain numbers in the precision of a side."""
-
-    def array(value: ScalarLike, name: str, least: float) -> Scalar:
-        if isinstance(value, jax.Array):
-            return value
-        return jnp.asarray(arguments.number(value, name, least=least), side.k1.dtype)
-
-    return array(overlap_max, "overlap_max [m]", 0.0), array(overlap, "overlap [m]", -math.inf)
+def _peak_and_drop(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
+    """Largest overlap and how far the present one is below it; plain numbers in the precision of a side."""
+    largest, now = (x if isinstance(x, jax.Array) else jnp.asarray(x, side.k1.dtype) for x in (overlap_max, overlap))
+    peak = largest_overlap(largest, now)
+    return peak, peak - now
 
 
 # ---- inside ----------------------------------------------------------------------------------------------------------
@@ -166,7 +243,7 @@ def _recovered(i: HalfContact, j: HalfContact, series: _Series) -> Scalar:
 
 @jax.custom_jvp
 def _series_force(i: Contact, j: Contact, peak: Scalar, drop: Scalar) -> Scalar:
-    series = _solve(i, j, peak)
+    series = _series(i, j, peak)
     span = i.recovered(series.d_i).span + j.recovered(series.d_j).span
     return series.force * _ratio(span, drop)[1]
 
@@ -195,15 +272,9 @@ def _widening(side: Contact, dside: Contact, d: Scalar, dd: Scalar, dforce: Scal
     """Twice the force times the change of a side's recovered compression."""
     per_span = recompute(recovered.bottom / recovered.top)
     with_force, with_peak, with_slope, with_c = side.growth(d, per_span, recovered.limited, recovered.steep)
-    square = d * d
-    dslope = dside.k1 - square * (3 * dside.k3 - 5 * square * dside.k5) - d * (6 * side.k3 - 20 * square * side.k5) * dd
+    dslope = dside.tangent(d) + 2 * side.halley(d)[2] * dd
     change = with_force * dforce + with_peak * side.secant(d) * dd + with_slope * dslope + with_c * dside.c
     return recovered.span * change
-
-
-def _explicit(change: Contact, d: Scalar) -> Scalar:
-    square = d * d
-    return d * (change.k1 - square * (change.k3 - square * change.k5))
 
 
 def _tangent(side: Contact, d: Scalar) -> Scalar:
@@ -236,7 +307,7 @@ def _series_change(i: Contact, j: Contact, series: _Series, di: Contact, dj: Con
     #   dF_P = (t_i t_j doverlap + t_j dF_i + t_i dF_j) / (t_i + t_j),   d(d_s) = (dF_P - dF_s) / t_s,
     # and d(d_i) + d(d_j) = doverlap; written without a division by a tangent that may be small.
     t_i, t_j = _tangent(i, series.d_i), _tangent(j, series.d_j)
-    change_i, change_j = _explicit(di, series.d_i), _explicit(dj, series.d_j)
+    change_i, change_j = di.halley(series.d_i)[0], dj.halley(series.d_j)[0]
     flexibility = recompute(1 / (t_i + t_j))
     return _Series(
         flexibility * (t_j * doverlap + change_j - change_i),
@@ -259,7 +330,7 @@ def _solve(i: Contact, j: Contact, overlap: Scalar) -> _Series:
 
 
 def _split(i: Contact, j: Contact, whole: Scalar) -> Scalar:
-    """Compression of i at equal force, by Newton's method with the curvature (Halley), kept between bounds.
+    """Compression of i at equal force, by Halley's method kept between bounds.
 
     Most contacts are done after a fixed number of steps, which compile to one loop over the data with one result. A
     split that still moves leaves it with a negative sign, and goes on between new bounds.
@@ -293,8 +364,8 @@ class _Bracket(NamedTuple):
 def _halley_step(i: Contact, j: Contact, whole: Scalar, bracket: _Bracket) -> _Bracket:
     """One bracketed Halley step. A split that meets the force but for rounding stays: the bounds would throw it out."""
     d, low, high = jnp.abs(bracket.d), bracket.low, bracket.high
-    force_i, slope_i, bend_i = quintic(i.k1, i.k3, i.k5, d)
-    force_j, slope_j, bend_j = quintic(j.k1, j.k3, j.k5, whole - d)
+    force_i, slope_i, bend_i = i.halley(d)
+    force_j, slope_j, bend_j = j.halley(whole - d)
     excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
     low = jnp.where(excess < 0, d, low)
     high = jnp.where(excess > 0, d, high)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -16,20 +17,9 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Scalar
-from .edges import Edges, stacked_lists, with_list
-from .equilibrium import Equilibrium, find_equilibrium
-from .measured import measured
-from .state import (
-    Packing,
-    State,
-    Vectors,
-    WallHistory,
-    check_packing,
-    check_state,
-    rebuild_list,
-    start,
-)
-from .stiffness import Problem, force_on_walls, net_force, pair_geometry, remembered
+from .edges import Edges, pair_geometry, stacked_lists, with_list
+from .equilibrium import Equilibrium, Problem, find_equilibrium, force_on_walls, net_force, remembered
+from .state import Packing, State, Vectors, WallHistory, check_packing, check_state, measured, rebuild_list, start
 from .walls import Cylinder, Plane, Walls
 
 BOTTOM, TOP = 0, 1
@@ -44,8 +34,8 @@ class Solver(eqx.Module):
         rtol: largest net force over the mean contact force.
         max_steps: evaluations before an equilibrium is given up.
         halvings: how often a load step that did not converge is halved.
-        skin: extra distance up to which pairs are listed, as a share of the mean radius. Ample: a load step that ends
-            with unlisted particles touching is solved again from there, and may so end elsewhere.
+        skin: extra distance up to which pairs are listed, as a share of the mean radius, so large that load steps
+            rarely end with unlisted particles touching: these are solved again from there, and may end elsewhere.
     """
 
     springs: tuple[float, ...] = eqx.field(static=True, default=(1e-1, 1e-2, 1e-3, 1e-4))
@@ -57,12 +47,10 @@ class Solver(eqx.Module):
     __repr__ = described()
 
     def __check_init__(self) -> None:
-        for spring in self.springs:
-            arguments.number(spring, "every one of springs", above=0)
-        arguments.number(self.rtol, "rtol", above=0)
+        for value in (*self.springs, self.rtol, self.skin):
+            arguments.number(value, "springs, rtol and skin", above=0)
         arguments.whole(self.max_steps, "max_steps", least=1)
         arguments.whole(self.halvings, "halvings")
-        arguments.number(self.skin, "skin", above=0)
         if not self.springs:
             raise InputError("a solver without springs", remedy="Give at least one.")
 
@@ -70,12 +58,8 @@ class Solver(eqx.Module):
 class LoadStep(NamedTuple):
     """What `replay_compaction` needs of a load step.
 
-    Attributes:
-        key, i, j: the list of edges.
-        height: of the top punch [m].
-        spring: stiffness of the proximal springs [N/m].
-        position: centres at its end [m].
-        last: whether a row of the table ends with it.
+    Its list of edges, the height of the top punch [m], the stiffness of the proximal springs [N/m], centres at its end
+    [m], and whether a row of the table ends with it.
     """
 
     key: Int[Array, " edges"]
@@ -90,10 +74,9 @@ class LoadStep(NamedTuple):
 
 
 class Compaction(NamedTuple):
-    """Rows of a compaction, one for each height asked for.
+    """Rows of a compaction, one for each height of the top punch over the bottom one [m].
 
     Attributes:
-        height: of the top punch over the bottom one [m].
         density: volume of the spheres over that of the die [-].
         top, bottom: force on the punches [N].
         converged: whether every load step of the row ended in equilibrium. Do not use a row that did not.
@@ -124,12 +107,12 @@ class Compaction(NamedTuple):
 
 
 class _Attempt(NamedTuple):
+    """One load step; it is complete if it settled with the weakest springs."""
+
     state: State
-    settled: Equilibrium
-    converged: bool
-    complete: bool
-    spring: float
+    equilibrium: Equilibrium
     stiffness: Scalar
+    complete: bool
     evaluations: int
     share: float
     move: float
@@ -138,16 +121,10 @@ class _Attempt(NamedTuple):
 def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None = None, passes: int = 40) -> State:
     """A state to start a compaction from: overlaps pushed apart, all contacts virgin.
 
-    Steps of steepest descent on the contacts' energy, implicit and so of any length (a proximal spring of 0.3 of the
-    mean stiffness), until the contacts carry next to nothing or the passes are used up. Above random close packing what
-    overlap is left is where the compaction begins. Scatter the spheres first (`scattered`) and lower them into the die.
-
-    Args:
-        packing: the spheres.
-        walls: the walls.
-        position: centres [m]; may overlap.
-        solver: skin, tolerance and steps.
-        passes: how many steps at most.
+    Implicit steps of steepest descent on the contacts' energy (a proximal spring of 0.3 of the mean stiffness), at most
+    so many `passes`, until the contacts carry next to nothing. Above random close packing what overlap is left is where
+    the compaction begins. Scatter the spheres first (`scattered`) and lower them into the die; their centres [m] may
+    overlap.
     """
     solver = solver or Solver()
     passes = arguments.whole(passes, "passes")
@@ -157,11 +134,11 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
     state = start(packing, walls, position, skin)
     for _ in range(passes):
         problem = Problem(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(0.3 * k))
-        settled = _find_equilibrium(problem, state.position, jnp.asarray(1e-3), solver.max_steps)
-        state = eqx.tree_at(lambda s: s.position, state, settled.position)
+        found = _find_equilibrium(problem, state.position, jnp.asarray(1e-3), solver.max_steps)
+        state = replace(state, position=found.position)
         if _moved(state) > skin / 2:
             state = rebuild_list(packing, state, skin)
-        if float(settled.balance.scale) < 1e-4 * k * float(jnp.mean(packing.radius)):
+        if float(found.balance.scale) < 1e-4 * k * float(jnp.mean(packing.radius)):
             break
     return start(packing, walls, state.position, skin)
 
@@ -181,8 +158,7 @@ def compact(
     as asked for (`spring`).
 
     Args:
-        packing: the spheres.
-        state: where to start (`relaxed`, `start`, or the end of another compaction or motion) in a `die`.
+        packing, state: where to start (`relaxed`, `start`, or the end of another compaction or motion) in a `die`.
         heights: of the top punch over the bottom one [m].
         solver: tolerances.
         tape: a list to which the load steps are appended, for `replay_compaction`.
@@ -200,7 +176,7 @@ def compact(
     if heights.ndim != 1 or not (np.isfinite(heights).all() and (heights > 0).all()):
         raise InputError("a height of the top punch that is not positive", remedy="Give the heights in metres.")
     still = jnp.zeros_like(state.position)
-    state = eqx.tree_at(lambda s: (s.velocity, s.spin), state, (still, still))
+    state = replace(state, velocity=still, spin=still)
     rows = []
     for height in heights:
         attempts = _reach(packing, state, float(height), solver, solver.halvings)
@@ -208,7 +184,10 @@ def compact(
         check_state(state)
         rows.append(_row(packing, state, attempts))
         if tape is not None:
-            tape.extend(_load_step(a, a is attempts[-1]) for a in attempts)
+            for one in attempts:
+                edges, position = one.state.edges, one.state.position
+                at = jnp.asarray(_height(one.state.walls), position.dtype)
+                tape.append(LoadStep(edges.key, edges.i, edges.j, at, one.stiffness, position, one is attempts[-1]))
     return state, Compaction(*(np.asarray(column) for column in zip(*rows, strict=True)))
 
 
@@ -229,42 +208,37 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     skin = solver.skin * float(jnp.mean(packing.radius))
     if _moved(state) > skin / 2:
         state = rebuild_list(packing, state, skin)
+    before = _height(state.walls)
     walls = lowered(state.walls, jnp.asarray(height, state.position.dtype))
-    squeeze = min(height / _height(state.walls), 1.0)
-    guess = state.position.at[:, 2].multiply(squeeze)
+    guess = state.position.at[:, 2].multiply(min(height / before, 1.0))
     k = float(jnp.mean(packing.sides.k1))
-    evaluations, reached = 0, 0.0
+    evaluations, complete = 0, False
     best: tuple[Problem, Equilibrium] | None = None
     for spring in solver.springs:
         problem = Problem(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(spring * k))
-        settled = _find_equilibrium(problem, guess, jnp.asarray(solver.rtol), solver.max_steps)
-        evaluations += int(settled.steps)
-        end = eqx.tree_at(lambda s: s.position, state, settled.position)
-        if _moved(end) > skin / 2 and np.isfinite(settled.position).all():
+        found = _find_equilibrium(problem, guess, jnp.asarray(solver.rtol), solver.max_steps)
+        evaluations += int(found.steps)
+        end = replace(state, position=found.position)
+        if _moved(end) > skin / 2 and np.isfinite(found.position).all():
             fresh = rebuild_list(packing, end, skin)
             if _unlisted(packing, state.edges, fresh):
-                state = eqx.tree_at(lambda s: (s.edges, s.listed_at), state, (fresh.edges, fresh.listed_at))
-                problem = eqx.tree_at(lambda h: h.edges, problem, fresh.edges)
-                settled = _find_equilibrium(problem, settled.position, jnp.asarray(solver.rtol), solver.max_steps)
-                evaluations += int(settled.steps)
-        if not bool(settled.converged):
-            best = best or (problem, settled)
+                state = replace(state, edges=fresh.edges, listed_at=fresh.listed_at)
+                problem = replace(problem, edges=fresh.edges)
+                found = _find_equilibrium(problem, found.position, jnp.asarray(solver.rtol), solver.max_steps)
+                evaluations += int(found.steps)
+        if not bool(found.converged):
+            best = best or (problem, found)
             break
-        guess, reached, best = settled.position, spring, (problem, settled)
+        guess, complete, best = found.position, spring == solver.springs[-1], (problem, found)
     assert best is not None  # there is at least one spring
-    problem, settled = best
-    edges, wall_history = _remembered(problem, settled.position)
-    end = eqx.tree_at(
-        lambda s: (s.position, s.edges, s.wall_history, s.walls), state, (settled.position, edges, wall_history, walls)
-    )
-    moved = np.asarray(settled.position - state.position)
-    springs, top = float(problem.proximal) * np.abs(moved[:, 2]).sum(), float(settled.balance.on_wall[TOP])
+    problem, found = best
+    edges, wall_history = _remembered(problem, found.position)
+    end = replace(state, position=found.position, edges=edges, wall_history=wall_history, walls=walls)
+    moved = np.asarray(found.position - state.position)
+    springs, top = float(problem.proximal) * np.abs(moved[:, 2]).sum(), float(found.balance.on_wall[TOP])
     share = float(springs / top) if top > 0 else math.inf
-    stroke = max(abs(height - _height(state.walls)), 1e-300)
-    move = float(np.linalg.norm(moved, axis=1).max()) / stroke
-    complete = reached == solver.springs[-1]
-    spring = float(problem.proximal) / k
-    return _Attempt(end, settled, bool(settled.converged), complete, spring, problem.proximal, evaluations, share, move)
+    move = float(np.linalg.norm(moved, axis=1).max()) / max(abs(height - before), 1e-300)
+    return _Attempt(end, found, problem.proximal, complete, evaluations, share, move)
 
 
 _find_equilibrium = eqx.filter_jit(find_equilibrium)
@@ -279,32 +253,24 @@ def _unlisted(packing: Packing, old: Edges, fresh: State) -> bool:
 
 
 def _row(packing: Packing, state: State, attempts: list[_Attempt]) -> tuple:
-    balance = attempts[-1].settled.balance
-    sample = measured(packing, state, jnp.zeros((len(state.walls), 3), state.position.dtype))
-    height = _height(state.walls)
+    balance, height = attempts[-1].equilibrium.balance, _height(state.walls)
+    touching, beyond, _ = measured(packing, state)
     _, _, barrel = die_walls(state.walls)
-    top, bottom = float(balance.on_wall[TOP]), float(balance.on_wall[BOTTOM])
     return (
         height,
         float(packing.volume) / (math.pi * float(barrel.radius) ** 2 * height),
-        top,
-        bottom,
-        all(a.converged for a in attempts),
+        float(balance.on_wall[TOP]),
+        float(balance.on_wall[BOTTOM]),
+        all(bool(a.equilibrium.converged) for a in attempts),
         float(jnp.max(jnp.abs(balance.net))) / max(float(balance.scale), 1e-300),
         max(a.share for a in attempts),
-        max(a.spring for a in attempts),
+        max(float(a.stiffness) for a in attempts) / float(jnp.mean(packing.sides.k1)),
         len(attempts),
         sum(a.evaluations for a in attempts),
         max(a.move for a in attempts),
-        int(sample.contacts),
-        int(sample.beyond_tested),
+        int(touching),
+        int(beyond),
     )
-
-
-def _load_step(attempt: _Attempt, last: bool) -> LoadStep:
-    state, edges = attempt.state, attempt.state.edges
-    height = jnp.asarray(_height(state.walls), state.position.dtype)
-    return LoadStep(edges.key, edges.i, edges.j, height, attempt.stiffness, state.position, last)
 
 
 def _height(walls: Walls) -> float:
@@ -320,7 +286,7 @@ def _moved(state: State) -> float:
 def lowered(walls: Walls, height: Scalar) -> Walls:
     """The walls with the top punch at a height over the bottom one."""
     bottom, top, barrel = cast(tuple[Plane, Plane, Cylinder], walls)
-    return bottom, eqx.tree_at(lambda w: w.point, top, bottom.point + height * bottom.normal), barrel
+    return bottom, replace(top, point=bottom.point + height * bottom.normal), barrel
 
 
 def die_walls(walls: Walls) -> tuple[Plane, Plane, Cylinder]:
@@ -338,15 +304,10 @@ def die_walls(walls: Walls) -> tuple[Plane, Plane, Cylinder]:
 
 
 class Replayed(NamedTuple):
-    """The load steps again, all of it differentiable but `converged`.
+    """The load steps again, all of it differentiable but `converged`; `edges` and `wall_history` are those at the end.
 
-    Attributes:
-        on_wall: force on bottom, top and barrel along their normals, summed over particles [N].
-        position: centres at the end of every load step [m].
-        edges, wall_history: the pairs and contacts with walls at the very end, with their largest overlaps.
-        residual: largest net force over the mean contact force [-].
-        proximal: sum of the proximal springs' axial forces, without sign [N].
-        converged: whether the step ended in equilibrium.
+    `on_wall` are forces on bottom, top and barrel along their normals [N], `proximal` sums of the springs' axial forces
+    without sign [N].
     """
 
     on_wall: Float[Array, "steps walls"]
@@ -368,12 +329,6 @@ def replay_compaction(
     Lists of edges, heights and springs are those of the tape; the equilibria are found again, each from where the tape
     has it, and differentiated by the implicit function theorem, history included. With a packing so different that
     particles meet that the tape does not list, contacts are missing: compact it instead.
-
-    Args:
-        packing: the spheres, for example as a function of the law's parameters under `jax.jvp`.
-        state: start of `compact`.
-        tape: its load steps.
-        solver: its solver.
     """
     return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), solver or Solver())
 
@@ -392,12 +347,13 @@ def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solv
         previous, recorded, edges, wall_history = carry
         edges = with_list(edges, step.key, step.i, step.j)
         problem = Problem(packing, lowered(state.walls, step.height), edges, wall_history, previous, step.spring)
-        settled = find_equilibrium(problem, previous + (step.position - recorded), solver.rtol, solver.max_steps)
-        edges, wall_history = remembered(problem, settled.position)
-        springs = step.spring * jnp.sum(jnp.abs(settled.position[:, 2] - previous[:, 2]))
-        net = jnp.max(jnp.abs(net_force(problem, settled.position)))
-        row = (force_on_walls(problem, settled.position), settled.position, net / settled.balance.scale, springs)
-        return (settled.position, step.position, edges, wall_history), (*row, settled.converged)
+        found = find_equilibrium(problem, previous + (step.position - recorded), solver.rtol, solver.max_steps)
+        position = found.position
+        edges, wall_history = remembered(problem, position)
+        springs = step.spring * jnp.sum(jnp.abs(position[:, 2] - previous[:, 2]))
+        residual = jnp.max(jnp.abs(net_force(problem, position))) / found.balance.scale
+        row = force_on_walls(problem, position), position, residual, springs, found.converged
+        return (position, step.position, edges, wall_history), row
 
     before = with_list(state.edges, steps.key[0], steps.i[0], steps.j[0])
     carry = (state.position, state.position, before, state.wall_history)

@@ -38,11 +38,9 @@ def sharded[Moving: eqx.Module](
     belongs to particles (positions, velocities, the packing) is on every device, and every device moves all of them. A
     step needs one reduction, of one array of forces, torques and forces on walls.
 
-    Args:
-        loop: called with what computes the contact forces, then packing, motion, state, and what is further. It returns
-            the state, and anything that is the same on all devices.
-        devices: those of one process or, after `jax.distributed.initialize`, of all. None: no division.
-        packing, motion, state, further: what the loop takes.
+    The loop is called with what computes the contact forces, then with packing, motion, state and what is further. It
+    returns the state, and anything that is the same on all devices. Devices are those of one process or, after
+    `jax.distributed.initialize`, of all; None is no division.
     """
     if devices is None:
         return loop(contact_forces, packing, motion, state, *further)
@@ -61,9 +59,8 @@ def sharded[Moving: eqx.Module](
         one_share, mesh=mesh, in_specs=(whole, whole, specs, *(whole for _ in further)), out_specs=(specs, whole)
     )(packing, motion, padded, *further)
     everywhere = NamedSharding(mesh, whole)
-    kept = [
-        jax.lax.with_sharding_constraint(x[:n], everywhere) for x, n in zip(_remembered(moved), lengths, strict=True)
-    ]
+    remembered = zip(_remembered(moved), lengths, strict=True)
+    kept = [jax.lax.with_sharding_constraint(x[:n], everywhere) for x, n in remembered]
     return eqx.tree_at(_sharded_leaves, moved, (*_sharded_leaves(state)[:3], *kept)), rest
 
 

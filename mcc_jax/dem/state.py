@@ -1,8 +1,9 @@
-"""What a packing is at one moment: places, velocities, contacts with their history, walls; its start, and on disk."""
+"""A packing: spheres, where they are, what their contacts remember, walls; its start, and on disk."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import arguments
 from .._archive import encode, read_archive
@@ -19,10 +19,14 @@ from .._errors import InputError
 from .._format import described
 from .._store import write_file
 from .._types import Scalar
-from .edges import Edges, carry_history, close_pairs, list_edges
-from .side import HalfContact
+from ..geometry import Particle
+from ..law import MccLaw
+from .edges import Edges, carry_history, close_pairs, list_edges, pair_geometry
+from .pair import HalfContact, half_contact, pair_split, passive, sides_of
 from .walls import Walls
 
+MCC_DENSITY = 1540.0
+"""True density of micro-crystalline cellulose, about [kg/m^3]."""
 SPARE = 1.1
 """Length of a new list of edges over the pairs found."""
 
@@ -30,13 +34,7 @@ Vectors = Float[Array, "particles 3"]
 
 
 class Packing(eqx.Module):
-    """Spheres, and how each of them pushes back.
-
-    Attributes:
-        radius: [m].
-        mass: [kg].
-        sides: half contacts, one a particle (``jax.vmap(half_contact)``).
-    """
+    """Spheres, with a half contact each (``jax.vmap(half_contact)``)."""
 
     radius: Float[Array, " particles"]
     mass: Float[Array, " particles"]
@@ -50,35 +48,83 @@ class Packing(eqx.Module):
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
-class WallHistory(eqx.Module):
-    """What the contacts with walls remember: dense, one place for each particle and wall.
+# ---- how it is made --------------------------------------------------------------------------------------------------
 
-    Attributes:
-        overlap_max: largest overlap so far [m].
-        slip: elastic tangential displacement of the wall against the particle's surface [m].
+
+def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing:
+    """Spheres of given diameters [um] and density, pores included [kg/m^3]: one law for all, or a batch of laws."""
+    diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
+    arguments.positive(diameter, "diameter [um]")  # traced ones pass
+    density = arguments.number(density, "density [kg/m^3]", above=0)
+    batched = law.a.ndim == 1 or law.plastic.C1.ndim == 1
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, law) if batched else None
+
+    def one(law: MccLaw, diameter: Array):
+        return half_contact(law, Particle(diameter, diameter, diameter))
+
+    radius = 0.5e-6 * diameter
+    sides = jax.vmap(one, (axes, 0))(law, diameter)
+    return Packing(radius, density * 4 / 3 * jnp.pi * radius**3, passive(sides))
+
+
+def scattered(
+    key: PRNGKeyArray, radius: Any, die_radius: float, gap: float = 0.02
+) -> tuple[Float[Array, "particles 3"], float]:
+    """Centres [m] of spheres over z = 0 in a die, none touching, and the height of the die [m]; a jittered lattice.
+
+    `gap` is the least distance between surfaces, as a share of the largest radius.
     """
+    radius = arguments.path(radius, "radius", many="Give one radius [m] for each sphere.")
+    arguments.positive(radius, "radius [m]")
+    die_radius = arguments.number(die_radius, "die_radius [m]", above=0)
+    gap = arguments.number(gap, "gap, a share of the largest radius,", least=0)
+    largest = float(jnp.max(radius))
+    pitch = (2 + 2 * gap) * largest
+    inner = die_radius - (1 + gap) * largest
+    if inner < 0:
+        raise InputError(f"a die of radius {die_radius} m is narrower than a particle", remedy="Make it wider.")
+    reach = math.floor(inner / pitch)
+    grid = np.array([(x, y) for x in range(-reach, reach + 1) for y in range(-reach, reach + 1)], float) * pitch
+    layer = grid[np.hypot(*grid.T) <= inner]
+    layers = math.ceil(len(radius) / len(layer))
+    centres = np.concatenate([np.column_stack([layer, np.full(len(layer), (k + 0.5) * pitch)]) for k in range(layers)])
+    order, shake = jax.random.split(key)
+    place = jnp.asarray(centres)[jax.random.permutation(order, len(centres))[: len(radius)]]
+    # A sphere may move by half of what is left between it and the largest there could be beside it.
+    room = jnp.maximum(0.5 * pitch - radius - 0.5 * gap * largest, 0.0) / math.sqrt(3)
+    shift = jax.random.uniform(shake, place.shape, minval=-1.0)
+    return place + jax.vmap(jnp.multiply)(shift, room), layers * pitch
+
+
+def relative_density(packing: Packing, radius: float, bottom: float, top: float) -> float:
+    """Volume of the spheres over that of the die between the punches [-]."""
+    radius = arguments.number(radius, "radius [m]", above=0)
+    bottom = arguments.number(bottom, "bottom [m]")
+    top = arguments.number(top, "top [m]", above=bottom)
+    return float(packing.volume) / (math.pi * radius**2 * (top - bottom))
+
+
+# ---- its state -------------------------------------------------------------------------------------------------------
+
+
+class WallHistory(eqx.Module):
+    """Largest overlap [m] of every particle with every wall, and slip of the wall against its surface [m]."""
 
     overlap_max: Float[Array, "particles walls"]
     slip: Float[Array, "particles walls 3"]
 
     __repr__ = described()
 
-    @classmethod
-    def virgin(cls, particles: int, walls: int, dtype: DTypeLike = jnp.float64) -> WallHistory:
-        """Nothing has touched yet."""
-        return cls(jnp.zeros((particles, walls), dtype), jnp.zeros((particles, walls, 3), dtype))
-
 
 class State(eqx.Module):
     """Everything that moves or remembers. Saved and loaded whole (`save_state`), it goes on bit for bit.
 
     Attributes:
-        position, velocity: of the centres [m, m/s].
-        spin: angular velocities [rad/s].
+        position, velocity, spin: of the particles [m, m/s, rad/s].
         edges, wall_history: pairs and contacts with walls, with their history.
         walls: the walls, where they are now.
-        listed_at, skin: positions when the list of edges was made, and extra distance up to which pairs were listed
-        [m]. time: [s].
+        listed_at, skin: positions when the edges were listed, and extra distance up to which pairs were listed [m].
+        time: [s].
     """
 
     position: Vectors
@@ -98,9 +144,7 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
     """A state at rest: virgin contacts, a fresh list of edges.
 
     Args:
-        packing: the spheres.
-        walls: the walls.
-        position: centres [m].
+        packing, walls, position: the spheres, the walls, and the centres [m].
         skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
         capacity: length of the list of edges; a tenth more than there are pairs if None.
 
@@ -112,19 +156,11 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
     position = arguments.values(position, "position", shape="centres [m], shape (N, 3)")
     if position.shape != (len(packing.radius), 3):
         raise InputError(f"position has the shape {position.shape} where ({len(packing.radius)}, 3) is expected")
-    skin = arguments.number(skin, "skin [m]", least=0)
-    dtype = position.dtype
-    state = State(
-        position,
-        jnp.zeros_like(position),
-        jnp.zeros_like(position),
-        list_edges(np.zeros((0, 2), np.int64), len(position), 0, dtype),
-        WallHistory.virgin(len(position), len(walls), dtype),
-        walls,
-        position,
-        jnp.asarray(skin, dtype),
-        jnp.zeros((), dtype),
-    )
+    count, dtype, still = len(position), position.dtype, jnp.zeros_like(position)
+    edges = list_edges([], count, 0, dtype)
+    history = WallHistory(jnp.zeros((count, len(walls)), dtype), jnp.zeros((count, len(walls), 3), dtype))
+    zero = jnp.zeros((), dtype)
+    state = State(position, still, still, edges, history, walls, position, zero, zero)
     check_state(state)
     return rebuild_list(packing, state, skin, capacity)
 
@@ -132,10 +168,7 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
 def rebuild_list(packing: Packing, state: State, skin: float, capacity: int | None = None) -> State:
     """The state with a fresh list of edges, also where that of the given one is stale; contacts keep their history.
 
-    Args:
-        skin: as in `start`.
-        capacity: length of the list; if None that of the present list, or a tenth more than the pairs if they do not
-            fit.
+    Without a `capacity`, the list is as long as the present one, or a tenth more than the pairs if they do not fit.
     """
     skin = arguments.number(skin, "skin [m]", least=0)
     if capacity is not None:
@@ -145,11 +178,30 @@ def rebuild_list(packing: Packing, state: State, skin: float, capacity: int | No
     if capacity is None and len(pairs) > room:
         room = 64 * math.ceil(SPARE * len(pairs) / 64 + 1)
     fresh = list_edges(pairs, len(state.position), room, state.edges.overlap_max.dtype)
-    fresh.require_room()
+    if bool(fresh.overflow):
+        raise InputError(
+            f"{len(pairs)} pairs do not fit into a list of {room} edges", remedy="Take a larger `capacity`."
+        )
     if state.edges.capacity:
         fresh = carry_history(state.edges, fresh)
-    reach = jnp.asarray(skin, state.skin.dtype)
-    return eqx.tree_at(lambda s: (s.edges, s.listed_at, s.skin), state, (fresh, state.position, reach))
+    return replace(state, edges=fresh, listed_at=state.position, skin=jnp.asarray(skin, state.skin.dtype))
+
+
+@jax.jit
+def measured(packing: Packing, state: State) -> tuple[Int[Array, ""], Int[Array, ""], Scalar]:
+    """Pairs and walls that touch, those compressed further than the paper's tests on a side, and kinetic energy [J]."""
+    edges, history = state.edges, state.wall_history
+    i, j = sides_of(packing.sides, edges.i), sides_of(packing.sides, edges.j)
+    overlap, _ = pair_geometry(packing.radius, state.position, edges)
+    d_i, d_j = jax.vmap(pair_split)(i, j, edges.overlap_max)
+    beyond = edges.active & ((d_i > i.tested) | (d_j > j.tested))
+    beyond_at_walls = history.overlap_max > packing.sides.tested[:, None]
+    extent = packing.radius.astype(state.position.dtype)
+    at_walls = [extent - jax.vmap(wall.distance)(state.position) for wall in state.walls]
+    touching = jnp.sum(overlap > 0) + sum(jnp.sum(x > 0) for x in at_walls)
+    velocity, spin = (jnp.sum(x**2, axis=1) for x in (state.velocity, state.spin))
+    kinetic = 0.5 * jnp.sum(packing.mass * velocity) + 0.2 * jnp.sum(packing.mass * packing.radius**2 * spin)
+    return touching, jnp.sum(beyond) + jnp.sum(beyond_at_walls), kinetic
 
 
 def check_packing(packing: Packing) -> None:
@@ -171,18 +223,18 @@ def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
 def check_state(state: State) -> None:
     """Refuse a state in which a position is not finite or a centre is behind a wall, naming particle and wall."""
     lost, behind = (np.asarray(x) for x in _escaped(state))
+    at = f"at {float(state.time):.6g} s"
     if lost.any():
         raise InputError(
-            f"the position of particle {np.flatnonzero(lost)[0]} is not finite at {float(state.time):.6g} s",
+            f"the position of particle {np.flatnonzero(lost)[0]} is not finite {at}",
             remedy="A smaller time step, or look at how the packing was made.",
         )
-    for w, wall in enumerate(state.walls):
-        if behind[w].any():
-            raise InputError(
-                f"particle {np.flatnonzero(behind[w])[0]} is outside wall {w} ({type(wall).__name__}) "
-                f"at {float(state.time):.6g} s",
-                remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
-            )
+    if behind.any():
+        w, particle = np.argwhere(behind)[0]
+        raise InputError(
+            f"particle {particle} is outside wall {w} ({type(state.walls[w]).__name__}) {at}",
+            remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
+        )
 
 
 @jax.jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -20,9 +21,8 @@ from .._format import described
 from ..calibrate import Posterior
 from ..calibrate.population import Scatter, flattened, particles_at
 from ..law import MccLaw, Plastic
-from .packings import MCC_DENSITY, spheres
 from .quasistatic import TOP, Compaction, LoadStep, Replayed, Solver, compact, replay_stacked, stacked
-from .state import Packing, State, not_monotone
+from .state import MCC_DENSITY, Packing, State, not_monotone, spheres
 
 PROBABILITY = (0.05, 0.5, 0.95)
 REDRAWS = 100  # of a particle's law, until it is monotone
@@ -45,8 +45,7 @@ class Sensitivity(NamedTuple):
             first column, dF/dln C3 three times the second, dF/dln C5 five times the third.
         euler_defect: :math:`|\sum_p p\,\partial F/\partial p - F| / F`, zero in exact arithmetic: F is homogeneous of
             degree one in all stresses (Euler's identity). In newtons where F = 0.
-        residual: largest net force over the mean contact force, the worst of the row's load steps.
-        proximal_share: the springs' axial forces, without sign, over F, the largest of the row's load steps.
+        residual, proximal_share: as of `Compaction`, the largest of the row's load steps.
         converged: whether this row and all before it, whose history it carries, are in equilibrium.
     """
 
@@ -63,10 +62,9 @@ class Sensitivity(NamedTuple):
 
 def rescaled(packing: Packing, log_scale: Float[Array, " 4"]) -> Packing:
     """The packing with K1 = C1, K3 = C3^3, K5 = C5^5 and Ebar of all particles times :math:`e^{s}`."""
-    sides = packing.sides
-    k1, k3, k5, modulus = (jnp.exp(s) for s in log_scale)
-    scaled = (sides.k1 * k1, sides.k3 * k3, sides.k5 * k5, sides.c / modulus**sides.power)
-    return eqx.tree_at(lambda p: (p.sides.k1, p.sides.k3, p.sides.k5, p.sides.c), packing, scaled)
+    sides, (k1, k3, k5, modulus) = packing.sides, jnp.exp(log_scale)
+    c = sides.c / modulus**sides.power
+    return replace(packing, sides=replace(sides, k1=sides.k1 * k1, k3=sides.k3 * k3, k5=sides.k5 * k5, c=c))
 
 
 def punch_sensitivity(
@@ -85,33 +83,26 @@ def punch_sensitivity(
     Args:
         packing_of: the packing as a function of parameters; at `values` the one that made the tape.
         values: parameters [any units].
-        state: start of `compact`.
-        tape: load steps of `compact`.
-        solver: of `compact`.
+        state, tape, solver: start, load steps and solver of `compact`.
     """
-    if not callable(packing_of):
-        raise InputError(f"packing_of must be a function of the values, got {arguments.kind_of(packing_of)}")
     values = jnp.asarray(values, float)
     last = np.array([step.last for step in tape])
     # Outside the compiled function: that one then is the same for all parametrisations.
     direction = jax.jacfwd(packing_of)(values)
     packing = packing_of(values)
     jacobian, (force, replayed) = _jacobian(packing, direction, state, stacked(tape), solver or Solver())
-    force, jacobian, worst = np.asarray(force), np.asarray(jacobian), np.asarray(replayed.residual)
-    row = np.concatenate([[0], np.cumsum(last)[:-1]])
-    by_stress = jacobian[last, len(values) :]
-    pressed = force > 0
+    force, jacobian = np.asarray(force), np.asarray(jacobian)
+    by_stress, pressed = jacobian[last, len(values) :], force > 0
     share = np.where(pressed, np.asarray(replayed.proximal) / np.where(pressed, force, 1.0), np.inf)
-    reached = np.logical_and.accumulate(np.asarray(replayed.converged))
-    rows = range(int(last.sum()))
+    starts = np.concatenate([[0], np.flatnonzero(last)[:-1] + 1])  # of the rows, among the load steps
     return Sensitivity(
         force[last],
         jacobian[last, : len(values)],
         by_stress,
         np.abs(by_stress.sum(axis=1) - force[last]) / np.where(pressed, force, 1.0)[last],
-        np.array([worst[row == r].max() for r in rows]),
-        np.array([share[row == r].max() for r in rows]),
-        reached[last],
+        np.maximum.reduceat(np.asarray(replayed.residual), starts),
+        np.maximum.reduceat(share, starts),
+        np.logical_and.accumulate(np.asarray(replayed.converged))[last],
     )
 
 
@@ -131,12 +122,7 @@ def _jacobian(
 
 
 class PopulationPacking(NamedTuple):
-    """A packing as a function of what a calibration learnt of the population, and the posterior draws of that.
-
-    Attributes:
-        packing_of: the packing for one row of `draws`; differentiable.
-        draws, names: (draws, columns), and the names of the columns.
-    """
+    """A packing as a differentiable function of one row of posterior draws of a population, and the named columns."""
 
     packing_of: PackingOf
     draws: np.ndarray
@@ -149,7 +135,6 @@ class Band(NamedTuple):
     """Quantiles of the force on the top punch, one column for each row of the compaction.
 
     Attributes:
-        height, density: of the rows.
         probability, quantiles: force on the top punch [N], (probabilities, rows).
         standard_deviation: of that force [N]; infinite where a single draw converged.
         used: draws that converged in a row; in the first-order band 1 where the one compaction did, else 0.
@@ -181,19 +166,13 @@ def population_packing(
     band is about the population, not about which particles one happened to take. Particles not monotone at the
     posterior mean are redrawn. Effects of the model act in the contacts, but for those of the instrument.
 
-    Args:
-        calibration: the posterior.
-        diameter: [um].
-        seed: of the z.
-        density: of a particle [kg/m^3].
+    Diameters are in um, the density of a particle in kg/m^3.
 
     Raises:
         InputError: if the population hardly has a monotone law; for effects that contacts cannot have, by name.
     """
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")
-    seed = arguments.seed(seed)
-    density = arguments.number(density, "density [kg/m^3]", above=0)
     model = calibration.model
     forms, varying = model.forms, model.scatter.varying
     population = eqx.tree_at(lambda p: p.log_noise, flattened(calibration.population), None)
@@ -215,12 +194,11 @@ def population_packing(
 
         return eqx.filter_vmap(one)(particles.latent, particles.theta)
 
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(arguments.seed(seed))
     z = rng.standard_normal((len(size), own.size))
+    mean = jnp.asarray(draws.mean(0))
     for _ in range(REDRAWS):
-        wrong = ~np.asarray(
-            eqx.filter_vmap(lambda law: law.is_monotone)(laws(jnp.asarray(draws.mean(0)), jnp.asarray(z)))
-        )
+        wrong = ~np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws(mean, jnp.asarray(z))))
         if not wrong.any():
             break
         z[wrong] = rng.standard_normal((int(wrong.sum()), own.size))
@@ -233,7 +211,7 @@ def population_packing(
     def packing_of(values: Array) -> Packing:
         return spheres(laws(values, kept), size, density)
 
-    packing_of(jnp.asarray(draws.mean(0)))  # refuses here, by name, effects that no contact can have
+    packing_of(mean)  # refuses here, by name, effects that no contact can have
     return PopulationPacking(packing_of, draws, names)
 
 
@@ -250,13 +228,7 @@ def first_order_band(
 
     .. math:: F_p = F(\bar\theta) + z_p\,\sqrt{J \Sigma J^T}, \qquad J = \partial F / \partial\theta
 
-    Args:
-        packing_of: the packing as a function of the parameters.
-        draws: of the parameters.
-        state: as for `compact`.
-        heights: as for `compact`.
-        solver: as for `compact`.
-        probability: of the quantiles.
+    `draws` are of the parameters, one row each; state, heights and solver are those of `compact`.
     """
     draws = _checked(draws, probability)
     mean = draws.mean(axis=0)
@@ -296,7 +268,6 @@ def band_by_draws(
     draws = _checked(draws, probability)
     packings = [packing_of(jnp.asarray(values)) for values in draws]
     every = [compact(packing, state, heights, solver)[1] for packing in packings]
-    wrong = max(int(not_monotone(packing).sum()) for packing in packings)
     # A row that did not settle hands its history on.
     forces = np.stack([np.where(np.logical_and.accumulate(rows.converged), rows.top, np.nan) for rows in every])
     rows = every[0]
@@ -306,23 +277,17 @@ def band_by_draws(
             f"no draw converged at the height {rows.height[np.argmin(used)]:.6g} m",
             remedy="Smaller load steps, or more halvings (`Solver.halvings`).",
         )
+    squares = np.nansum((forces - np.nanmean(forces, axis=0)) ** 2, axis=0)
     return Band(
         rows.height,
         rows.density,
         np.asarray(probability, float),
         np.nanquantile(forces, np.asarray(probability, float), axis=0),
-        _deviation(forces),
+        np.where(used > 1, np.sqrt(squares / np.maximum(used - 1, 1)), np.inf),
         used,
-        wrong,
+        max(int(not_monotone(packing).sum()) for packing in packings),
         forces=forces,
     )
-
-
-def _deviation(forces: np.ndarray) -> np.ndarray:
-    """Standard deviation of the draws that converged; nothing is known of it from one."""
-    used = np.isfinite(forces).sum(axis=0)
-    spread = np.nansum((forces - np.nanmean(forces, axis=0)) ** 2, axis=0)
-    return np.where(used > 1, np.sqrt(spread / np.maximum(used - 1, 1)), np.inf)
 
 
 def _checked(draws: np.ndarray, probability: Sequence[float]) -> np.ndarray:
@@ -335,10 +300,9 @@ def _checked(draws: np.ndarray, probability: Sequence[float]) -> np.ndarray:
 
 
 class CompactionFit(NamedTuple):
-    """Parameters fitted to a compaction curve.
+    """Parameters fitted to a compaction curve, and the compaction with them.
 
     Attributes:
-        values, compaction: the parameters, and the rows of the compaction with them.
         misfit: root mean square of force minus measured force, over the largest measured force [-].
         rounds: compactions made again on the way.
         converged: whether the last round no longer changed the parameters and every row is in equilibrium.
@@ -374,9 +338,7 @@ def fit_compaction(
     Args:
         packing_of: the packing as a function of the parameters; traced by JAX.
         start: where to start.
-        state: as for `compact`.
-        heights: as for `compact`.
-        solver: as for `compact`.
+        state, heights, solver: as for `compact`.
         force: on the top punch at the heights [N].
         tolerance: of the parameters, relative and absolute.
 
@@ -387,12 +349,7 @@ def fit_compaction(
     tolerance = arguments.number(tolerance, "tolerance", above=0)
     values, heights = arguments.path(start, "start"), arguments.path(heights, "heights")
     measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")
-    if (
-        measured.ndim != 1
-        or measured.shape != np.shape(heights)
-        or len(measured) < len(values)
-        or not np.isfinite(measured).all()
-    ):
+    if measured.shape != np.shape(heights) or measured.size < len(values) or not np.isfinite(measured).all():
         raise InputError(
             f"{measured.size} forces for {len(heights)} heights and {len(values)} parameters",
             remedy="One finite force for each height, and no fewer than parameters.",

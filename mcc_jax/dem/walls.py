@@ -6,7 +6,6 @@ from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .. import arguments
@@ -19,20 +18,16 @@ Vector = Float[Array, " 3"]
 
 
 def _vector(value: Any) -> Vector:
-    array = arguments.values(value, "a vector", shape="three numbers")
-    if array.shape[-1:] != (3,):
-        raise InputError(f"a vector has three components, got the shape {array.shape}")
-    return array
+    return arguments.values(value, "a vector", shape="three numbers")
+
+
+def dot(one: Vector, other: Vector) -> Scalar:
+    """Inner product, written out: a CPU adds up the rows of a table one number at a time."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 class Plane(eqx.Module):
-    """A plane; particles are on the side to which its normal points.
-
-    Attributes:
-        point: any point of it [m].
-        normal: unit vector into the space of the particles.
-        velocity: how fast it moves [m/s].
-    """
+    """A plane through a point [m]; its normal, a unit vector, points to the particles; it moves at a velocity [m/s]."""
 
     point: Vector = eqx.field(converter=_vector)
     normal: Vector = eqx.field(converter=_vector)
@@ -58,11 +53,8 @@ class Cylinder(eqx.Module):
 
     .. math:: \text{distance} = R + t \max(z - z_{rim}, 0) - \sqrt{x^2 + y^2}
 
-    Attributes:
-        radius: R [m].
-        rim: height above which the chamfer starts [m]; infinite for none.
-        chamfer: t, widening per height above the rim [-].
-        velocity: how fast it moves along z (third component) and, for friction, as a body [m/s].
+    The rim, above which the chamfer t starts, may be infinite [m]. The velocity [m/s] moves it along z, and acts as a
+    whole in friction.
     """
 
     radius: Scalar = eqx.field(converter=scalar)
@@ -99,23 +91,14 @@ Wall: TypeAlias = Plane | Cylinder
 Walls: TypeAlias = tuple[Wall, ...]
 
 
-def die(radius: float, height: float, dtype: DTypeLike = jnp.float64) -> Walls:
-    """A closed die: bottom punch at z = 0, top punch at the height, cylinder between them with its rim at the height.
-
-    (bottom, top, cylinder), at rest; give them velocities with `set_velocity`.
-    """
+def die(radius: float, height: float) -> Walls:
+    """A closed die at rest: bottom punch at z = 0, top punch and rim of the cylinder at the height [m]."""
     radius = arguments.number(radius, "the radius of a die [m]", above=0)
     height = arguments.number(height, "the height of a die [m]", above=0)
 
-    def along_z(z: float) -> Array:
-        return jnp.asarray([0.0, 0.0, z], dtype)
-
-    rest = along_z(0.0)
-    return (
-        Plane(rest, along_z(1.0), rest),
-        Plane(along_z(height), along_z(-1.0), rest),
-        Cylinder(jnp.asarray(radius, dtype), jnp.asarray(height, dtype), jnp.asarray(0.05, dtype), rest),
-    )
+    rest, up = jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0])
+    barrel = Cylinder(radius, height, 0.05, rest)
+    return Plane(rest, up, rest), Plane(height * up, -up, rest), barrel
 
 
 def set_velocity(walls: Walls, velocity: Any) -> Walls:
@@ -127,11 +110,6 @@ def set_velocity(walls: Walls, velocity: Any) -> Walls:
         eqx.tree_at(lambda w: w.velocity, wall, v.astype(wall.velocity.dtype))
         for wall, v in zip(walls, velocity, strict=True)
     )
-
-
-def dot(one: Vector, other: Vector) -> Scalar:
-    """Inner product, written out: a CPU adds up the rows of a table one number at a time."""
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def _length(vector: Float[Array, " 2"]) -> Scalar:

@@ -40,7 +40,7 @@ def of_modulus_at_peaks(base: Base, formulas: Fitted, solution: Solution) -> tup
             context = law.context(particle, record)
             factors = (effect.stiffness(context)[record.force.argmax()] for effect in law.effects)
             factor = math.prod(factors, start=jnp.ones(()))
-            return jnp.log(factor * context.law.effective_modulus / law.formulas.effective_modulus)
+            return jnp.log(factor * context.law.effective_modulus / law.effective_modulus)
 
         found = jax.vmap(one)(state.point.latent, base.tests.particle, base.tests.record).mean()
         return found, found  # the value, too

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Values
-from ..formulas import PUNCH_AREA, Formulas, recovery, tangent_modulus
+from ..formulas import PUNCH_AREA, Formulas, recovery
 from ..geometry import Particle
 from .effect import AbstractEffect, Factors, at_least, on_terms
 from .record import Context, Record, contact_radius, root
@@ -45,10 +45,9 @@ class RateDependence(AbstractEffect):
         stress_rate = particle.stress(record.loading_rate)
         if self.rate_of == "stress":
             return stress_rate / REFERENCE_STRESS_RATE + jnp.zeros_like(strain)
-        K1, K3, K5 = law.plastic.polynomial
         eta = law.shape_factor(particle)
-        slope = tangent_modulus(K1, K3, K5, eta * strain)
-        return stress_rate / (eta * at_least(slope, 0.1 * K1)) / REFERENCE_STRAIN_RATE
+        slope = at_least(law.plastic.tangent(eta * strain), 0.1 * law.plastic.C1)
+        return stress_rate / (eta * slope) / REFERENCE_STRAIN_RATE
 
     def factor(self, rate: Values) -> Values:
         known = rate > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ def scaled(law: Formulas, first: Scalar, others: Scalar, modulus: Scalar) -> For
     """The law with its linear term, its cubic and quintic terms, and its modulus multiplied by factors > 0."""
     C = law.plastic
     plastic = Plastic(C.C1 * first, C.C3 * jnp.cbrt(others), C.C5 * others**0.2)
-    return Formulas(plastic, law.a, law.effective_modulus * modulus, law.unloading, law.strain_scaling)
+    return replace(law, plastic=plastic, effective_modulus=law.effective_modulus * modulus)
 
 
 class Strength(AbstractEffect):
@@ -104,7 +105,7 @@ class SecondOrderShape(AbstractEffect):
         g = at_least(self.of(particle))
         power = law.strain_scaling.power / law.unloading.stress_power
         plastic = Plastic(law.plastic.C1 * g, law.plastic.C3 * g, law.plastic.C5 * g)
-        return Formulas(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
+        return replace(law, plastic=plastic, effective_modulus=law.effective_modulus * g**power)
 
 
 SHAPE = family(SecondOrderShape, "shape_second_order",

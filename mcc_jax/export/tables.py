@@ -87,12 +87,12 @@ def curve_tables(
     check(law, particle)
     strain_max = arguments.number(strain_max, "strain_max", above=0)
     tolerance = arguments.number(tolerance, "tolerance", above=0)
-    formulas, side = law.formulas, None
+    formulas, side = law, None
     if law.effects:
         if particle is None:
             raise InputError("particle must be given", remedy="Make one with mcc_jax.Particle(D1, D2, D3), in um.")
         side = half_contact(law, particle)
-        formulas, _ = folded(formulas, law.effects, particle, "the tables")
+        formulas, _ = folded(law, law.effects, particle, "the tables")
     n, k = law.unloading.stress_power, law.unloading.constant
     plain = Contact(*formulas.plastic.polynomial, 1 / (k * formulas.effective_modulus**n), power=n)
 

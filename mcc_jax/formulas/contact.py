@@ -13,8 +13,8 @@ documentation, "The law". In a pair each side has its own limit; the sides carry
 
 from __future__ import annotations
 
-import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,14 +23,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._numerics import recompute, running_max
-from .._types import Flag, Path, Scalar, Values
-from .loading_inverse import loading_strain, loading_work, secant_modulus, tangent_modulus
+from .._types import Path, Scalar, Values
+from .loading import Quintic, reached
 from .recovery import energy_ratio, recovery, stress_ratio
-from .unloading import StrainScaling, Unloading
 
 SHARE = 3 * math.pi / 8
 r"""Largest :math:`\Delta F'/F_P`. Elastic energy is :math:`\tfrac{4}{3\pi} F_P \Delta`; with it :math:`F^2/(2F')`."""
-
+PEAKS = 256
+"""Peaks, evenly spread, at which `first_gain` asks whether more is lost than at the one before."""
 
 Flags = Bool[Array, "..."]
 
@@ -38,8 +38,7 @@ Flags = Bool[Array, "..."]
 class Recovered(NamedTuple):
     """What full release from a peak gives back, as a quotient top / bottom; 1 where no force was carried.
 
-    Whether the peak carries force, the recovered displacement is at its limit, and there at the second of its two
-    terms.
+    Whether the peak carries force, and whether the limit holds, and there the second of its two terms.
     """
 
     top: Values
@@ -59,7 +58,7 @@ class Recovered(NamedTuple):
         return jnp.where(self.carries, self.span, 0.0)
 
 
-class Contact(eqx.Module):
+class Contact(Quintic):
     """A particle against a plane: platens (um, mN), a wall or a neighbour in a particle code (m, N).
 
     Attributes:
@@ -68,9 +67,6 @@ class Contact(eqx.Module):
         power: n, 1 for the printed unloading form and 2 for the punch forms.
     """
 
-    k1: Values
-    k3: Values
-    k5: Values
     c: Values
     power: int = eqx.field(static=True, default=1, kw_only=True)
 
@@ -89,13 +85,7 @@ class Contact(eqx.Module):
         return peaks[-1], self.force(peaks, peaks - displacement)
 
     def under(self, displacement_max: Scalar, force: Values, highest: Values) -> tuple[Values, Values]:
-        """Largest displacement so far and displacement under forces, one or many.
-
-        Args:
-            displacement_max: the largest before the first of the forces.
-            force: the forces.
-            highest: the largest force up to each of them.
-        """
+        """Largest displacement so far and displacement under forces, one or many, each with the highest up to it."""
         # The barriers make stages that share nothing but what they are given. Where they share intermediate values, XLA
         # stores those and cuts the loop over the data of the inverse in many pieces.
         contact = jax.lax.optimization_barrier(self)
@@ -103,44 +93,18 @@ class Contact(eqx.Module):
 
         contact, displacement_max, highest = jax.lax.optimization_barrier((self, displacement_max, highest))
         peak_force = jnp.where(highest < past, past, highest)
-        reached = loading_strain(contact.k1, contact.k3, contact.k5, peak_force, displacement_max)
-        elastic = (highest < past) | (reached < displacement_max)
-        peak = jax.lax.optimization_barrier(jnp.where(elastic, displacement_max, reached))
+        loaded = reached(Quintic(contact.k1, contact.k3, contact.k5), peak_force, displacement_max)
+        elastic = (highest < past) | (loaded < displacement_max)
+        peak = jax.lax.optimization_barrier(jnp.where(elastic, displacement_max, loaded))
 
         contact, force, highest = jax.lax.optimization_barrier((self, force, highest))
         peak_force = jnp.where(highest < past, past, highest)
         recovered = contact.recovered(peak)
         # Below that, the quotient's derivatives overflow.
-        loaded = recovered.carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
-        ratio = recompute(jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0))
+        carries = recovered.carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
+        ratio = recompute(jnp.where(carries, force, 0.0) / jnp.where(carries, peak_force, 1.0))
         released = recovered.span * recovery(ratio)
-        return peak, peak - jnp.where(loaded & (force < peak_force), released, 0.0)
-
-    # ---- loading -------------------------------------------------------------------------------------------------
-
-    def secant(self, displacement: Values) -> Values:
-        """Loading force over displacement, never below zero."""
-        return secant_modulus(self.k1, self.k3, self.k5, displacement)
-
-    def tangent(self, displacement: Values) -> Values:
-        """Slope of loading."""
-        return tangent_modulus(self.k1, self.k3, self.k5, displacement)
-
-    def loading(self, displacement: Values) -> Values:
-        """Force of loading."""
-        return displacement * self.secant(displacement)
-
-    def work(self, displacement: Values) -> Values:
-        """Work of loading."""
-        return loading_work(self.k1, self.k3, self.k5, displacement)
-
-    @property
-    def is_monotone(self) -> Flag:
-        r"""Whether the force never falls while displacement grows: :math:`9 k_3^2 \le 20 k_1 k_5`.
-
-        Where it falls the split of a pair is not unique. About 2.4 % of the paper's log-normal draws do.
-        """
-        return 9 * self.k3 * self.k3 <= 20 * self.k1 * self.k5
+        return peak, peak - jnp.where(carries & (force < peak_force), released, 0.0)
 
     # ---- unloading -----------------------------------------------------------------------------------------------
 
@@ -156,8 +120,7 @@ class Contact(eqx.Module):
     def recovered(self, peak: Values, secant: Values | None = None) -> Recovered:
         """What full release from a peak displacement gives back.
 
-        The secant is force over displacement there, if effects moved it off the curve of loading; the limit stays that
-        of the curve.
+        The secant is that of a peak which effects moved off the curve; the limit stays that of the curve.
         """
         square = self.formula_squared(peak, secant)
         tiny = jnp.finfo(peak.dtype).tiny  # down to where the root still has a derivative
@@ -203,9 +166,7 @@ class Contact(eqx.Module):
 
         .. math:: dF = f\, dF_P + (F_P / \Delta) f'\, d(drop) + h\, (2 F_P\, d\Delta / \Delta) \quad (`growth`).
 
-        Args:
-            peak: largest displacement so far.
-            drop: how far the displacement is below it, >= 0; 0 is loading, with the derivative of loading.
+        A drop of 0 is loading, with the derivative of loading.
         """
         return _force(self.bare, peak, drop)
 
@@ -220,6 +181,24 @@ def stored(force: Values, span: Values, drop: Values) -> tuple[Values, Values]:
     scale = jnp.where(force > 0, force * span, 0.0)
     at_peak = scale * energy_ratio(jnp.zeros_like(s))
     return at_peak, jnp.where(drop <= 0, at_peak, scale * energy_ratio(s))
+
+
+def first_gain(at_peak: Callable[[Scalar], Contact], highest: Scalar) -> Scalar:
+    """Smallest peak displacement beyond which further loading gains energy; infinite where it never does.
+
+    What is lost, the work of loading less what full release gives back, depends on the peak alone. Where it falls (by
+    more than rounding) from one peak to the next, a contact that is released, loaded further and released again has
+    gained. NaN counts as a gain. `at_peak` is the contact that unloads from a peak displacement.
+    """
+    peaks = highest * jnp.linspace(0.0, 1.0, PEAKS + 1, dtype=highest.dtype)
+
+    def balance(peak: Scalar) -> tuple[Scalar, Scalar]:
+        contact = at_peak(peak)
+        return contact.work(peak), contact.stored(peak, jnp.zeros_like(peak))[0]
+
+    work, given_back = jax.vmap(balance)(peaks)
+    holds = jnp.diff(work - given_back) >= -8 * jnp.finfo(work.dtype).eps * work[-1]
+    return jax.lax.stop_gradient(jnp.where(jnp.all(holds), jnp.inf, peaks[jnp.argmin(holds)]))
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
@@ -268,83 +247,3 @@ def _branch(contact: Contact, peak: Values, drop: Values) -> tuple[Values, Recov
     per_span = recompute(recovered.bottom / recovered.top)
     s = jnp.where(recovered.carries, drop * per_span, 1.0)
     return contact.loading(peak), recovered, per_span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s))
-
-
-# ---- the four numbers from law and size ------------------------------------------------------------------------------
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
-def coefficients(
-    unloading: Unloading,
-    scaling: StrainScaling,
-    area: float,
-    K1: Scalar,
-    K3: Scalar,
-    K5: Scalar,
-    modulus: Scalar,
-    eta: Scalar,
-    length: Scalar,
-    inverse: Scalar,
-) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    r"""k1, k3, k5 and c of a contact with :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` at :math:`x = \eta_p \gamma / L`.
-
-    .. math:: k_m = A K_m (\eta_p / L)^m, \qquad c = L^3 / (k\, \eta_p^p\, (\bar E A)^n)
-
-    with k and n of the `Unloading` form and p of the `StrainScaling`. Derivatives are written out, because reverse mode
-    then takes half as many operations.
-
-    Args:
-        area: A / L^2, which turns K and the unit of length into the unit of force.
-        K1, K3, K5, modulus: factors of the quintic, and the effective modulus [MPa].
-        eta: shape factor [-].
-        length, inverse: L, effective diameter or radius, and one over it, for derivatives a function of the length.
-    """
-    first, third, fifth, _ = _powers(area, eta, length, inverse)
-    c = _compliance(unloading, scaling, area, unloading.stress_power, modulus, eta, length, inverse)
-    return K1 * first, K3 * third, K5 * fifth, c
-
-
-@coefficients.defjvp
-def _coefficients_jvp(unloading: Unloading, scaling: StrainScaling, area: float, primals: Any, tangents: Any) -> Any:
-    K1, K3, K5, *size = primals
-    dK1, dK3, dK5, dmodulus, deta, dlength, _ = tangents
-    _, eta, length, inverse = size
-    first, third, fifth, square = _powers(area, eta, length, inverse)
-    by_eta, by_length = area * length, area * eta
-    n, p = unloading.stress_power, scaling.power
-    c, per_modulus = (_compliance(unloading, scaling, area, k, *size) for k in (n, n + 1))
-    dc = (3 - 2 * n) * (c * inverse) * dlength - n * per_modulus * dmodulus
-    changes = (
-        first * dK1 + K1 * (by_eta * deta + by_length * dlength),
-        third * dK3 + K3 * square * (3 * by_eta * deta - by_length * dlength),
-        fifth * dK5 + K5 * (square * square) * (5 * by_eta * deta - 3 * by_length * dlength),
-        dc - p * recompute(c / eta) * deta if p else dc,
-    )
-    # Transposed, these are barriers for the cotangents, which otherwise would be computed again for each input. One for
-    # each: what does not depend on the input at hand has no transpose.
-    return (K1 * first, K3 * third, K5 * fifth, c), tuple(map(jax.lax.optimization_barrier, changes))
-
-
-def _powers(area: float, eta: Scalar, length: Scalar, inverse: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """k_m / K_m for m = 1, 3, 5, and the square of the scaled strain over the displacement."""
-    slope = eta * inverse
-    square = slope * slope
-    first = area * (eta * length)
-    third = first * square
-    return first, third, third * square, square
-
-
-def _compliance(
-    unloading: Unloading,
-    scaling: StrainScaling,
-    area: float,
-    power: int,
-    modulus: Scalar,
-    eta: Scalar,
-    length: Scalar,
-    inverse: Scalar,
-) -> Scalar:
-    """c, or c over the modulus with its power one higher: a quotient of its own, which reverse mode need not store."""
-    n, p = unloading.stress_power, scaling.power
-    rest = unloading.constant * area**n * eta**p
-    return recompute((length if n == 1 else inverse) / (rest * modulus**power))

@@ -27,14 +27,22 @@ from .._types import Path, Scalar
 from ..effects import AbstractEffect, Context, Record
 from ..formulas import Formulas, Plastic, StrainScaling, Unloading
 from ..geometry import Particle
-from .loading import NEWTON_STEPS, base_strain, newton_step, slope_at, stress_at
 from .mcc import MccLaw
-from .response import additions, hold_virgin, initial_memory, peak_displacement, peak_forces, released
+from .response import (
+    NEWTON_STEPS,
+    additions,
+    base_strain,
+    initial_memory,
+    newton_step,
+    peak_displacement,
+    peak_forces,
+    released,
+    slope_at,
+    stress_at,
+)
 
-DIRECTIONS = 12
-"""As many as two effects with two further numbers each need; with fewer the rest is padding, so that all formulas share
-programs. More are a program more."""
-
+DIRECTIONS = 12  # as many as two effects with two further numbers each need; fewer are padded, to share programs
+INSIDE = "modify", "loading", "stiffness"  # hooks that act on the law itself
 SETTLED = 1e-9  # relative step of the strain from which on the last step of Newton's method is exact to rounding
 
 
@@ -47,12 +55,8 @@ def padded(directions: int) -> int:
 
 
 class Numbers(NamedTuple):
-    """What displacement depends on, of every test; arrays of JAX or NumPy.
-
-    Attributes:
-        law: C1, C3, C5, a and the effective modulus, shape (tests, 5).
-        force, peak: force of every point, and that from which its branch starts [mN], shape (tests, points).
-        effects: amplitude and further numbers of each effect, shape (tests, numbers).
+    """Of every test: C1, C3, C5, a and the effective modulus; the force of every point and that from which its branch
+    starts [mN]; amplitude and further numbers of each effect.
     """
 
     law: Any
@@ -63,12 +67,7 @@ class Numbers(NamedTuple):
 
 @dataclass(frozen=True)
 class Formula:
-    """An effect without its numbers.
-
-    Attributes:
-        effect: the effect, whatever its numbers.
-        names: the fields that are its numbers, the amplitude first.
-    """
+    """An effect without its numbers, and the names of the fields that are its numbers, the amplitude first."""
 
     effect: AbstractEffect
     names: tuple[str, ...]
@@ -91,14 +90,8 @@ def along(
 ) -> tuple[Float[Array, "tests points"], Float[Array, "along tests points"]]:
     """Displacement [um] of virgin particles along their tests, and its derivatives along directions of all numbers.
 
-    Each of the effects acts through its own programs: two together compile nothing that each alone did not.
-
-    Args:
-        forms: of the law.
-        formulas: what acts besides.
-        particle, record: one of every test; `record.peak` is given.
-        numbers: where.
-        directions: with a leading axis; where formulas act, the last one is along nothing (`padded`).
+    Particle and record, with its peaks, have an axis of tests; `directions` have a leading axis, and where formulas
+    act the last of them is along nothing (`padded`).
     """
     tests, law, d_law = (particle, record), numbers.law, directions.law
     loads, d_loads = (numbers.force, numbers.peak), (directions.force, directions.peak)
@@ -249,7 +242,7 @@ def _reached(
     def peak(given: Any, particle: Particle, record: Record, _: Any) -> Array:
         strain, *loads = given
         _, _, record, highest = _loaded(law[0], loads, particle, record, forms)
-        return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), hold_virgin(record))
+        return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3))
 
     off, change = _staged(residual, (law, loads, factors), (*directions, slopes), (particle, strain), None)
     by_strain = jax.tree.map(lambda x: x[-1], slopes)
@@ -264,7 +257,7 @@ def _reached(
 def signatures(
     base: MccLaw, particle: Particle, record: Record, effects: Sequence[AbstractEffect]
 ) -> Float[Array, "effects steps"]:
-    r"""Derivatives of the displacement by the amplitude of each effect, all amplitudes being zero.
+    r"""Derivatives of the displacement by the amplitude of each effect [um per unit], all amplitudes being zero.
 
     The same as one `jax.jvp` of `base.with_effects(effect).respond` per effect, at a fraction of what that takes to
     compile: at the null every effect acts through its own first-order change of parameters, loading strain, modulus and
@@ -273,64 +266,55 @@ def signatures(
     .. math:: \frac{\partial\gamma}{\partial\theta_k} = \frac{\partial\gamma}{\partial p}\cdot\frac{\partial p}
         {\partial\theta_k} + \frac{\partial\Delta_k}{\partial\theta_k}.
 
-    Batch it over particles with `equinox.filter_vmap`.
-
-    Args:
-        base: the law.
-        particle: the particle.
-        record: its test.
-        effects: one for every point of every variant's grid; their amplitudes are taken as zero.
-
-    Returns:
-        Derivatives [um per unit of amplitude].
+    Batch it over particles with `equinox.filter_vmap`. The amplitudes that the effects have are not used.
     """
-    context = replace(base, effects=()).context(particle, record)
-    formulas = base.formulas
-    strain, zero_um = _virgin_strain(formulas, context), jnp.zeros_like(particle.D3)
-    slope = slope_at(formulas, particle, strain, [], [])
+    if not effects:
+        return jnp.zeros((0, *record.force.shape), record.force.dtype)
+    law = replace(base, effects=())
+    context = law.context(particle, record)
+    strain, zero_um = _virgin_strain(law, context), jnp.zeros_like(particle.D3)
+    slope = slope_at(law, particle, strain, [], [])
 
     def changes(effect: AbstractEffect) -> tuple[Any, Path]:
         """First-order change of parameters, loading strain and modulus if it acts there, and of what is added."""
-        loads, inside = effect.overrides("loading"), effect.overrides("modify", "loading", "stiffness")
+        loads, inside = effect.overrides("loading"), effect.overrides(*INSIDE)
 
         def act(amplitude: Scalar) -> tuple[Any, Any, Any, Path]:
             own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
-            law = eqx.filter(own.modify(formulas, particle, record), eqx.is_inexact_array) if inside else None
-            factors = own.loading(formulas, particle, record, strain) if loads else None
+            changed = eqx.filter(own.modify(law, particle, record), eqx.is_inexact_array) if inside else None
+            factors = own.loading(law, particle, record, strain) if loads else None
             start = eqx.tree_at(lambda m: m.point.time, initial_memory((own,), zero_um), record.time[0])
-            return law, factors, own.stiffness(context) if inside else None, additions((own,), start, context)[-1]
+            return changed, factors, own.stiffness(context) if inside else None, additions((own,), start, context)[-1]
 
         zero = jnp.zeros_like(effect.amplitude)
-        law, factors, stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
-        shift = -stress_at(formulas, particle, strain, [factors]) / slope if loads else jnp.zeros_like(strain)
-        return (law, shift, stiffness) if inside else None, added
+        changed, factors, stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
+        shift = -stress_at(law, particle, strain, [factors]) / slope if loads else jnp.zeros_like(strain)
+        return (changed, shift, stiffness) if inside else None, added
 
-    if not effects:
-        return jnp.zeros((0, *record.force.shape), record.force.dtype)
     groups: dict[object, list[int]] = {}
     effects = [replace(effect, label="") for effect in effects]  # which would keep apart what is compiled at once
     for i, effect in enumerate(effects):
         groups.setdefault((type(effect), jax.tree.structure(effect)), []).append(i)
-    within: list[tuple[list[int], Any, Path]] = []
-    after: list[tuple[list[int], Path]] = []
-    for members in groups.values():
+    order: list[int] = []
+    rows, directions, further = [], [], []
+    for members in sorted(groups.values(), key=lambda members: effects[members[0]].overrides(*INSIDE)):
         alike = [jax.tree.map(jnp.asarray, effects[i]) for i in members]
         inside, added = jax.vmap(changes)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike))
+        order += members
         if inside is None:
-            after.append((members, added))
+            rows.append(added)
         else:
-            within.append((members, inside, added))
-    rows = [added for _, added in after]
-    if within:
-        parameters, rest = eqx.partition(formulas, eqx.is_inexact_array)
+            directions.append(inside)
+            further.append(added)
+    if directions:
+        parameters, rest = eqx.partition(law, eqx.is_inexact_array)
 
         def response(parameters: Any, shift: Path, stiffness: Path) -> Path:
             return _response(eqx.combine(parameters, rest), context, shift, stiffness)
 
         _, push = jax.linearize(response, parameters, jnp.zeros_like(strain), jnp.ones_like(strain))
-        directions = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(inside for _, inside, _ in within))
-        rows.append(jax.vmap(push)(*directions) + jnp.concatenate([added for _, _, added in within]))
-    order = [i for members, *_ in (*after, *within) for i in members]
+        along = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *directions)
+        rows.append(jax.vmap(push)(*along) + jnp.concatenate(further))
     return jnp.concatenate(rows)[np.argsort(order)]
 
 
@@ -343,5 +327,5 @@ def _response(law: Formulas, context: Context, shift: Path, stiffness: Path) -> 
     """Displacement of a virgin particle whose loading strain is shifted and whose modulus has a factor."""
     particle, record, highest = context.particle, context.record, context.peak_force
     strain = _virgin_strain(law, context) + shift
-    peak = peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), hold_virgin(record))
+    peak = peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3))
     return released(Context(particle, law, record, highest, *(peak,) * 3), [stiffness]).displacement

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import abc
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,39 +12,90 @@ import jax
 import jax.numpy as jnp
 
 from .. import arguments
-from .._errors import InputError
-from .._format import described, value_of
+from .._format import described
 from .._numerics import compiled_whole, running_max
 from .._types import Flag, Path, Scalar, scalar
-from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record, Variant, clean_record, find_variant
+from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record, clean_record
 from ..effects.record import first_point
-from ..formulas import Contact, Formulas
+from ..formulas import Contact, Formulas, first_gain
 from ..geometry import Particle
-from .base import AbstractContactLaw
-from .passivity import first_gain
 from .response import (
+    context_along,
+    describe,
     factor_at_peak,
     folded,
     force_at,
-    hold_virgin,
+    given_effects,
     initial_memory,
-    modified,
-    one_point,
     peak_forces,
-    whole_path,
+    respond,
 )
 
 TESTED_STRAIN = 0.67
 """Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
 
 
-class History(eqx.Module):
-    """What a particle remembers: the largest platen displacement, and with effects what they remember.
+class AbstractContactLaw[State](eqx.Module):
+    """One particle between two platens: `init` gives the virgin state, `step` advances it, `path` is its scan.
 
-    Attributes:
-        displacement_max: largest displacement so far [um]; 0 for a virgin particle. With effects that of the law
-            itself, without what they add.
-        memory: what effects and instrument remember (`Memory`); None for a law without effects.
+    Batch laws and particles with `equinox.filter_vmap`. No method checks values: `simulate.drive` does.
+    """
+
+    @property
+    def is_monotone(self) -> Flag:
+        """Whether force never falls while the displacement of a virgin particle grows."""
+        return jnp.asarray(True)
+
+    @property
+    def is_valid(self) -> Flag:
+        """Whether every parameter is in its range."""
+        return jnp.asarray(True)
+
+    def carries_stress(self, particle: Particle) -> Flag:
+        """Whether the law gives this particle any stress at all."""
+        return jnp.asarray(True)
+
+    def gain_strain(self, particle: Particle, state: State) -> Scalar:
+        """Peak strain [-], up to that of the state, beyond which loading and release gain energy; infinite if none."""
+        return jnp.full_like(particle.D3, jnp.inf)
+
+    @abc.abstractmethod
+    def init(self, particle: Particle) -> State:
+        """State of a particle that was never loaded."""
+
+    @abc.abstractmethod
+    def step(
+        self, particle: Particle, state: State, displacement: Scalar, time: Scalar | None = None
+    ) -> tuple[State, Scalar]:
+        """Force [mN] at the platen displacement [um] at the time [s], and the state after it."""
+
+    @abc.abstractmethod
+    def step_load(
+        self, particle: Particle, state: State, force: Scalar, time: Scalar | None = None
+    ) -> tuple[State, Scalar]:
+        """Platen displacement [um] under the force [mN] at the time [s], and the state after it."""
+
+    def path(
+        self, particle: Particle, state: State, displacement: Path, time: Path | None = None
+    ) -> tuple[State, Path]:
+        """Forces [mN] along a path of displacements [um] at times [s], by `lax.scan` of `step`."""
+        return _scan(self.step, particle, state, displacement, time)
+
+    def path_load(self, particle: Particle, state: State, force: Path, time: Path | None = None) -> tuple[State, Path]:
+        """Displacements [um] along a path of forces [mN] at times [s], by `lax.scan` of `step_load`."""
+        return _scan(self.step_load, particle, state, force, time)
+
+
+def _scan(step: Callable[..., Any], particle: Particle, state: Any, path: Path, time: Path | None) -> Any:
+    """A law that knows no time need not have it among its arguments."""
+    along = (path,) if time is None else (path, time)
+    return jax.lax.scan(lambda past, now: step(particle, past, *now), state, along)
+
+
+class History(eqx.Module):
+    """What a particle remembers: its largest platen displacement [um], and what effects remember, None without any.
+
+    The displacement is that of the law itself, without what effects add.
     """
 
     displacement_max: Scalar = eqx.field(converter=scalar)
@@ -53,37 +105,13 @@ class History(eqx.Module):
 
 
 class Energy(eqx.Module):
-    """Energy balance of one particle [nJ]; `work = recoverable + dissipated`.
-
-    Attributes:
-        work: work done by the platens up to now.
-        recoverable: what the particle would still give back on full release.
-        dissipated: what is lost for good; unchanged by unloading and reloading.
-    """
+    """Work done on a particle [nJ]: what it would still give back on full release, and what is dissipated."""
 
     work: Scalar
     recoverable: Scalar
     dissipated: Scalar
 
     __repr__ = described(work="nJ", recoverable="nJ", dissipated="nJ")
-
-
-def _told(effect: AbstractEffect) -> str:
-    """An effect with the name and the unit of its amplitude, where a formula of the library made it."""
-    try:
-        variant = find_variant(effect.label)
-    except InputError:
-        return repr(effect)
-    unit = "" if variant.unit == "-" else f" {variant.unit}"
-    others = [f"{n.name} {value_of(getattr(effect, n.name))}" for n in variant.nuisances if hasattr(effect, n.name)]
-    return ", ".join([f"{effect.label}: {variant.parameter} {value_of(effect.amplitude)}{unit}", *others])
-
-
-def _effects(value: Any) -> tuple[AbstractEffect, ...]:
-    remedy = 'Take law.with_effects("creep"), or mcc_jax.effects.find_variant("creep").build(0.02).'
-    if isinstance(value, str | AbstractEffect) or not isinstance(value, Iterable):
-        raise InputError(f"effects must be a list of effects, got {arguments.kind_of(value)}", remedy=remedy)
-    return tuple(value)
 
 
 class MccLaw(Formulas, AbstractContactLaw[History]):
@@ -98,11 +126,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         \sigma &= \tfrac{2}{\pi} \sigma_P \left[\arccos s - s\sqrt{1 - s^2}\right],\quad
             s = (\epsilon_P - \epsilon)/\delta && \text{elastic unloading and reloading}
 
-    and zero once s >= 1 (`formulas.Contact`). The recovered strain :math:`\delta` has three forms (`Unloading`) and
-    three ways in which :math:`\eta_p` enters (`StrainScaling`); the defaults are the paper's. Rate independent, no
-    adhesion.
-
-    `effects` act on it together. Under load control, the primary form,
+    and zero once s >= 1 (`formulas.Contact`). Rate independent, no adhesion. Effects act under load control,
 
     .. math:: \gamma(F, t) = \gamma_{law}(F;\, \text{modified parameters}) + \sum_k \Delta_k(F, t),
 
@@ -120,7 +144,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         effective_modulus: :math:`\bar E = E/(1-\nu^2)` [MPa], > 0; its value belongs to the chosen `unloading` form.
         unloading: form of the recovered strain, also as its text: "printed", "punch", "punch_exact".
         strain_scaling: how the shape factor enters it, also as its text: "raw", "contact", "master".
-        effects: what acts in addition to the formulas above; their order does not matter beyond rounding.
+        effects: what acts in addition; their order does not matter beyond rounding.
 
     Raises:
         InputError: for a plain number out of its range, or an unknown form.
@@ -129,34 +153,26 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         Bommireddy et al. (2018), eqs. 16, 23 and 24.
     """
 
-    effects: tuple[AbstractEffect, ...] = eqx.field(converter=_effects, default=())
+    effects: tuple[AbstractEffect, ...] = eqx.field(converter=given_effects, default=())
 
     def _rows(self) -> list[tuple[str, str]]:
-        return [*super()._rows(), *(("effect", _told(effect)) for effect in self.effects)]
+        return [*super()._rows(), *(("effect", describe(effect)) for effect in self.effects)]
 
     @property
     def is_valid(self) -> Flag:
         """Whether C1, C5 and the modulus are positive, C3 is not negative, and every number is finite."""
-        valid = self.formulas.is_valid
+        valid = super().is_valid
         for leaf in jax.tree.leaves(eqx.filter(self.effects, eqx.is_inexact_array)):
             valid = valid & jnp.all(jnp.isfinite(leaf))
         return valid
 
-    @property
-    def formulas(self) -> Formulas:
-        """The law's parameters alone, without effects."""
-        return Formulas(self.plastic, self.a, self.effective_modulus, self.unloading, self.strain_scaling)
-
     # ---- effects -----------------------------------------------------------------------------------------------------
 
     def with_effects(self, *effects: Any) -> MccLaw:
-        """The law with further effects.
-
-        Args:
-            effects: each by name, "mechanism" or "mechanism:variant" of `mcc_jax.effects.LIBRARY`, or a `Variant`, both
-                with the middle of its plausible range; or an effect built with an amplitude of one's own.
+        """The law with further effects: by name, "mechanism" or "mechanism:variant", or as a `Variant`, both with the
+        middle of its plausible range; or built with another amplitude.
         """
-        return self._with((*self.effects, *(_one_effect(effect) for effect in effects)))
+        return self._with((*self.effects, *given_effects(effects)))
 
     def of_particle(self) -> MccLaw:
         """The law without what belongs to the instrument (frame, drift, platens)."""
@@ -171,13 +187,6 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def _with(self, effects: tuple[AbstractEffect, ...]) -> MccLaw:
         # Not by the constructor, which takes one law's numbers only and not those of a batch of laws.
         return eqx.tree_at(lambda law: law.effects, self, effects, is_leaf=lambda x: isinstance(x, tuple) and not x)
-
-    # ---- peak --------------------------------------------------------------------------------------------------------
-
-    def internal_variables(self, particle: Particle, history: History) -> tuple[Scalar, Scalar]:
-        r"""The paper's :math:`(\epsilon_P, \sigma_P)`: largest strain [-] and its stress [MPa]."""
-        strain_max = particle.strain(history.displacement_max)
-        return strain_max, self.loading_stress(particle, strain_max)
 
     @compiled_whole
     def residual_displacement(self, particle: Particle, history: History) -> Scalar:
@@ -198,9 +207,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     ) -> tuple[History, Scalar]:
         """Force [mN] at the platen displacement [um] (negative: not yet touching) and time [s], and the history after.
 
-        With effects: the force that makes `step_load` meet the displacement, which must grow with force; 0 where the
-        platen does not touch. Where it jumps (a law that is not monotone, a pop-in), the force stays at that of the
-        jump.
+        With effects the force that makes `step_load` meet the displacement, or that at which it jumps over it (a law
+        that is not monotone, a pop-in); 0 where the platen does not touch.
         """
         if self.effects:
             # What one MPa takes is a scale for a particle that was never loaded.
@@ -220,11 +228,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         A force <= 0 means out of contact: the displacement stays where the platen left the particle.
         """
         if self.effects:
-            now: Scalar = state.memory.point.time if time is None else time
-            peak, memory, displacement = one_point(
-                self.formulas, self.effects, particle, state.displacement_max, state.memory, force, now
-            )
-            return History(peak, memory), displacement
+            state, displacement = self.path_load(particle, state, force[None], None if time is None else time[None])
+            return state, displacement[0]
         peak, displacement = self.contact(particle).under(state.displacement_max, force, force)
         return History(peak), displacement
 
@@ -250,10 +255,9 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         A scan follows the effects' memories only. For measured, noisy forces make a `Record` and use `respond`.
         """
         if self.effects:
-            before = state.memory.point
+            before, peak_force = state.memory.point, state.memory.peak_force
             time = jnp.broadcast_to(before.time, force.shape) if time is None else time
             humidity = before.relative_humidity
-            peak_force = state.memory.peak_force
             record = clean_record(force, time, relative_humidity=humidity, before=before, peak_force=peak_force)
             return self._along(particle, state, record)
         peak, displacement = self.contact(particle).under(state.displacement_max, force, running_max(force))
@@ -271,14 +275,10 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def context(self, particle: Particle, record: Record) -> Context:
         """What effects see along a record, from a virgin particle: the law with modified parameters."""
         zero = jnp.zeros_like(particle.D3)
-        return modified(
-            self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), hold_virgin(record)
-        )
+        return context_along(self, self.effects, particle, zero, record, peak_forces(record, zero))
 
     def _along(self, particle: Particle, state: History, record: Record) -> tuple[History, Path]:
-        peak, memory, displacement = whole_path(
-            self.formulas, self.effects, particle, state.displacement_max, state.memory, record
-        )
+        peak, memory, displacement = respond(self, self.effects, particle, state.displacement_max, state.memory, record)
         return History(peak, memory), displacement
 
     # ---- energy ------------------------------------------------------------------------------------------------------
@@ -287,18 +287,15 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def gain_strain(self, particle: Particle, state: History) -> Scalar:
         """Smallest peak strain [-] beyond which the particle, loaded further and released, gains energy.
 
-        Infinite where it does not up to the state's peak, and without damage and densification it never does. Methods
-        that advance the law do not ask; `simulate.drive` does. Effects on parameters and on the modulus at the peak
-        enter; others (cyclic damage, rates, creep) have no energy in closed form and are left aside.
+        Infinite where it does not up to the state's peak, and without damage and densification it never does. Effects
+        on parameters and on the modulus at the peak enter; others have no energy in closed form and are left aside.
         """
         at_peak = tuple(e for e in self.effects if isinstance(e, AbstractModulusAtPeak))
         if not at_peak:
             return super().gain_strain(particle, state)
         record = first_point(particle.D3.dtype) if state.memory is None else state.memory.point
-        formulas = self.formulas
-        for effect in self.effects:
-            formulas = effect.modify(formulas, particle, record)
-        contact_at = functools.partial(_unloading_from, formulas, at_peak, particle)
+        law = functools.reduce(lambda law, effect: effect.modify(law, particle, record), self.effects, self)
+        contact_at = functools.partial(_unloading_from, law, at_peak, particle)
         return particle.strain(first_gain(contact_at, state.displacement_max))
 
     @compiled_whole
@@ -308,15 +305,12 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         .. math:: W_{rec} = \pi R_e^2 D_e\, \sigma_P\, \delta\, g(s), \quad g(0) = \tfrac{4}{3\pi}, \qquad
             W_{diss} = W_{load}(\epsilon_P) - W_{rec}(s = 0)
 
-        A displacement beyond the peak counts as further loading. Effects on parameters and on the modulus at the peak
-        enter.
-
-        Raises:
-            InputError: naming another effect, whose energy has no closed form.
+        A displacement beyond the peak counts as further loading. `InputError` names an effect whose energy has no
+        closed form.
         """
         peak = jnp.where(displacement >= history.displacement_max, displacement, history.displacement_max)
-        formulas, at_peak = folded(self.formulas, self.effects, particle, "the energy")
-        contact = _unloading_from(formulas, at_peak, particle, peak)
+        law, at_peak = folded(self, self.effects, particle, "the energy")
+        contact = _unloading_from(law, at_peak, particle, peak)
         whole, now = contact.stored(peak, peak - displacement)
         dissipated = contact.work(peak) - whole
         return Energy(dissipated + now, now, dissipated)
@@ -333,16 +327,3 @@ def _unloading_from(
 def _moved(given: tuple[Any, Particle, History, Scalar | None], force: Scalar) -> Scalar:
     law, particle, state, time = given
     return law.step_load(particle, state, force, time)[1]
-
-
-def _one_effect(effect: Any) -> AbstractEffect:
-    if isinstance(effect, str):
-        effect = find_variant(effect)
-    if isinstance(effect, Variant):
-        return effect.build(effect.typical)
-    if not isinstance(effect, AbstractEffect):
-        remedy = 'Give a name such as "creep:logarithmic", a Variant, or what its build(amplitude) makes.'
-        raise InputError(
-            f"an effect must be a name, a Variant or an effect, got {arguments.kind_of(effect)}", remedy=remedy
-        )
-    return effect

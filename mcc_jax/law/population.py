@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._format import described
 from .._types import Scalar, ScalarLike, scalar
 from ..arguments import finite, positive, whole
-from ..formulas.plastic import Plastic
+from ..formulas import Plastic
 
 AnyShape = Float[Array, "..."]
 
@@ -27,12 +27,7 @@ def _sd(value: ScalarLike) -> Scalar:
 
 
 class LogNormal(eqx.Module):
-    r"""A log-normal quantity, :math:`\log C \sim N(\mu, \tau^2)`.
-
-    Attributes:
-        mean: mu, mean of the logarithm.
-        sd: tau >= 0, standard deviation of the logarithm.
-    """
+    r"""A log-normal quantity with mean and standard deviation of its logarithm, :math:`\log C \sim N(\mu, \tau^2)`."""
 
     mean: Scalar = eqx.field(converter=_mean)
     sd: Scalar = eqx.field(converter=_sd)
@@ -59,11 +54,7 @@ class LogNormal(eqx.Module):
 
 
 class PlasticPopulation(eqx.Module):
-    """Log-normal, independent C1, C3, C5 of a batch of particles (Bommireddy et al. 2018, Table 2 and eq. 17).
-
-    Attributes:
-        C1, C3, C5: their distributions.
-    """
+    """Log-normal, independent C1, C3, C5 of a batch of particles (Bommireddy et al. 2018, Table 2 and eq. 17)."""
 
     C1: LogNormal
     C3: LogNormal
@@ -83,11 +74,8 @@ class PlasticPopulation(eqx.Module):
 
     def stress_sd(self, x: AnyShape) -> AnyShape:
         """Standard deviation [MPa] of the stress at the scaled strain x."""
-        return jnp.sqrt(
-            self.C1.variance_of_power(1) * x**2
-            + self.C3.variance_of_power(3) * x**6
-            + self.C5.variance_of_power(5) * x**10
-        )
+        first, third, fifth = (C.variance_of_power(k) for C, k in ((self.C1, 1), (self.C3, 3), (self.C5, 5)))
+        return jnp.sqrt(first * x**2 + third * x**6 + fifth * x**10)
 
     @property
     def yield_stress(self) -> Scalar:
@@ -100,14 +88,15 @@ class PlasticPopulation(eqx.Module):
     @property
     def probability_not_monotone(self) -> Scalar:
         r"""Share of particles with :math:`9 C_3^6 > 20 C_1 C_5^5`: a normal tail, as log C enters linearly."""
-        gap = jnp.log(20 / 9) + self.C1.mean + 5 * self.C5.mean - 6 * self.C3.mean
-        spread = jnp.sqrt(self.C1.sd**2 + 25 * self.C5.sd**2 + 36 * self.C3.sd**2)
-        return norm.cdf(-gap / spread)
+        return self._softer_than(20 / 9)
 
     @property
     def probability_tensile(self) -> Scalar:
         r"""Share of particles whose quintic is negative somewhere, :math:`C_3^6 > 4 C_1 C_5^5`."""
-        gap = jnp.log(4.0) + self.C1.mean + 5 * self.C5.mean - 6 * self.C3.mean
+        return self._softer_than(4.0)
+
+    def _softer_than(self, limit: float) -> Scalar:
+        gap = jnp.log(limit) + self.C1.mean + 5 * self.C5.mean - 6 * self.C3.mean
         spread = jnp.sqrt(self.C1.sd**2 + 25 * self.C5.sd**2 + 36 * self.C3.sd**2)
         return norm.cdf(-gap / spread)
 

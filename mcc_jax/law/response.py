@@ -12,26 +12,57 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 
+from .. import arguments
 from .._errors import InputError
+from .._format import value_of
 from .._numerics import forward_fill, running_max
 from .._types import Path, Scalar, Values
-from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record
-from ..effects.record import first_point, follow
-from ..formulas import Formulas, recovery
+from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Factors, Record, Variant, find_variant
+from ..effects.record import first_point
+from ..formulas import Formulas, Quintic, recovery
+from ..formulas.loading import reached
 from ..geometry import Particle
-from .loading import strain_under
 
 Effects = tuple[AbstractEffect, ...]
 HALVINGS = 64  # from the width of the bracket to below the rounding of a double
+NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effects/test_physics.py
+
+
+# ---- effects as users give them --------------------------------------------------------------------------------------
+
+
+def given_effects(effects: Any) -> tuple[AbstractEffect, ...]:
+    """Effects from effects, variants and names, or from one of these."""
+    given = [effects] if isinstance(effects, str | Variant | AbstractEffect) else effects
+    return tuple(map(_one_effect, given))
+
+
+def _one_effect(effect: Any) -> AbstractEffect:
+    if isinstance(effect, str):
+        effect = find_variant(effect)
+    if isinstance(effect, Variant):
+        effect = effect.build(effect.typical)
+    if not isinstance(effect, AbstractEffect):
+        problem = f"an effect must be a name, a Variant or an effect, got {arguments.kind_of(effect)}"
+        remedy = 'Give a name such as "creep:logarithmic", a Variant, or what its build(amplitude) makes.'
+        raise InputError(problem, remedy=remedy)
+    return effect
+
+
+def describe(effect: AbstractEffect) -> str:
+    """An effect with the name and the unit of its amplitude, where a formula of the library made it."""
+    try:
+        variant = find_variant(effect.label)
+    except InputError:
+        return repr(effect)
+    unit = "" if variant.unit == "-" else f" {variant.unit}"
+    others = [f"{n.name} {value_of(getattr(effect, n.name))}" for n in variant.nuisances if hasattr(effect, n.name)]
+    return ", ".join([f"{effect.label}: {variant.parameter} {value_of(effect.amplitude)}{unit}", *others])
 
 
 class Memory(eqx.Module):
-    """What effects and instrument remember of a test.
-
-    Attributes:
-        point: the latest point of the test.
-        peak_force: largest force so far [mN].
-        of_effects, drivers: one entry per effect, None for those without a memory; what drove each at the latest point.
+    """What effects and instrument remember of a test: its latest point, the largest force so far [mN], and the memory
+    of each effect and what drove it there, None for those without one.
     """
 
     point: Record
@@ -47,129 +78,90 @@ def initial_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | N
     return Memory(first_point(zero.dtype, relative_humidity), zero, own, drivers)
 
 
+# ---- along a path ----------------------------------------------------------------------------------------------------
+
+
+def respond(
+    law: Formulas, effects: Effects, particle: Particle, displacement_max: Scalar, memory: Memory, record: Record
+) -> tuple[Scalar, Memory, Path]:
+    """Largest displacement of the law [um], memory and displacements [um] after the points of a record."""
+    highest = peak_forces(record, memory.peak_force)
+    context = context_along(law, effects, particle, displacement_max, record, highest)
+    own, drivers, added = additions(effects, memory, context)
+    last = record, highest, context.peak_displacement
+    point, peak_force, displacement_max = jax.tree.map(lambda x: x[-1] if x.ndim else x, last)
+    return displacement_max, Memory(point, peak_force, own, drivers), context.displacement + added
+
+
 def peak_forces(record: Record, before: Scalar) -> Path:
     """Force from which the branch of every point starts [mN]: the record's own peaks, else the largest so far."""
     highest = running_max(record.force) if record.peak is None else record.peak
     return jnp.where(highest > before, highest, before)
 
 
-def hold_virgin(record: Record) -> Callable[[Path], Path]:
-    """What carries the displacement of virgin loading along the branches that follow.
-
-    The running maximum, or where the record knows its peaks, the latest value on virgin loading.
-    """
-    if record.peak is None:
-        return running_max
-    virgin = (record.force >= record.peak).at[0].set(True)
-    return lambda values: forward_fill(values, virgin)
-
-
-def one_point(
-    law: Formulas,
-    effects: Effects,
-    particle: Particle,
-    displacement_max: Scalar,
-    memory: Memory,
-    force: Scalar,
-    time: Scalar,
-) -> tuple[Scalar, Memory, Scalar]:
-    """Largest displacement of the law [um], memory and displacement [um] after one more point; for `lax.scan`."""
-    before = memory.point
-    now = jax.lax.stop_gradient(follow(before, memory.peak_force, force, time))
-    record = eqx.tree_at(lambda r: (r.force, r.time, r.relative_humidity), now, (force, time, before.relative_humidity))
-    highest = jnp.where(force > memory.peak_force, force, memory.peak_force)
-    context = modified(law, effects, particle, displacement_max, record, highest, lambda x: x)
-
-    def remember(effect: AbstractEffect, own: Any, driven: Scalar) -> tuple[Any, Any, Scalar]:
-        driver = effect.driver(context)
-        return *effect.evolve(own, driven, driver, time - before.time), driver
-
-    own, drivers, values = _remember(effects, memory, remember)
-    after = Memory(record, highest, own, drivers)
-    return context.peak_displacement, after, context.displacement + _added(effects, context, values)
-
-
-def whole_path(
-    law: Formulas, effects: Effects, particle: Particle, displacement_max: Scalar, memory: Memory, record: Record
-) -> tuple[Scalar, Memory, Path]:
-    """The same after all points of a record, closed form but for the memories."""
-    highest = peak_forces(record, memory.peak_force)
-    context = modified(law, effects, particle, displacement_max, record, highest, hold_virgin(record))
-    own, drivers, added = additions(effects, memory, context)
-    point, highest = jax.tree.map(lambda x: x[-1] if x.ndim else x, (record, highest))
-    after = Memory(point, highest, own, drivers)
-    return context.peak_displacement[-1], after, context.displacement + added
-
-
-def modified(
-    law: Formulas,
-    effects: Effects,
-    particle: Particle,
-    displacement_max: Scalar,
-    record: Record,
-    highest: Values,
-    along: Callable[[Values], Values],
+def context_along(
+    law: Formulas, effects: Effects, particle: Particle, displacement_max: Scalar, record: Record, highest: Path
 ) -> Context:
-    """The law with modified parameters, loading and modulus: what effects see.
-
-    Args:
-        law: the law without effects.
-        displacement_max: the largest displacement before [um].
-        record: one point or all of them.
-        highest: the largest force so far [mN].
-        along: the running maximum, or nothing for a single point.
-    """
+    """What effects see: the law with modified parameters, loading and modulus, from a largest displacement [um]."""
     for effect in effects:
         law = effect.modify(law, particle, record)
     loading = tuple(e for e in effects if e.overrides("loading"))
     stiffening = tuple(e for e in effects if e.overrides("stiffness"))
     if loading:
         strain = strain_under(loading, law, particle, record, particle.stress(record.force))
-        reached = moved = peak_displacement(particle, record, highest, strain, displacement_max, along)
+        peak = moved = peak_displacement(particle, record, highest, strain, displacement_max)
     else:
-        reached, moved = law.contact(particle).under(displacement_max, record.force, highest)
-    recoverable = law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached))
-    context = Context(particle, law, record, highest, reached, recoverable, moved)
+        peak, moved = law.contact(particle).under(displacement_max, record.force, highest)
+    recoverable = law.recoverable_displacement(particle, peak, highest, jnp.ones_like(peak))
+    context = Context(particle, law, record, highest, peak, recoverable, moved)
     if loading or stiffening:
         context = released(context, [effect.stiffness(context) for effect in stiffening])
     return context
 
 
 def peak_displacement(
-    particle: Particle,
-    record: Record,
-    highest: Values,
-    strain: Values,
-    displacement_max: Scalar,
-    along: Callable[[Values], Values],
-) -> Values:
-    """Largest displacement so far [um], from the strain of virgin loading at every point's force."""
-    new = along(jnp.where(record.force >= highest, particle.displacement(strain), 0.0))
+    particle: Particle, record: Record, highest: Path, strain: Path, displacement_max: Scalar
+) -> Path:
+    """Largest displacement so far [um], from the strain of virgin loading at every point's force.
+
+    Where the record knows its peaks, the branches that follow carry the latest value on virgin loading.
+    """
+    on_loading = jnp.where(record.force >= highest, particle.displacement(strain), 0.0)
+    if record.peak is None:
+        new = running_max(on_loading)
+    else:
+        new = forward_fill(on_loading, (record.force >= record.peak).at[0].set(True))
     return jnp.where(new > displacement_max, new, displacement_max)
 
 
 def released(context: Context, factors: Sequence[Values]) -> Context:
     """The context with these factors on the effective modulus of its branches."""
-    law, particle, reached = context.law, context.particle, context.peak_displacement
-    factor = math.prod(factors, start=jnp.ones_like(reached))
-    recoverable = law.recoverable_displacement(particle, reached, context.peak_force, factor)
+    peak = context.peak_displacement
+    factor = math.prod(factors, start=jnp.ones_like(peak))
+    recoverable = context.law.recoverable_displacement(context.particle, peak, context.peak_force, factor)
     share = jnp.where(context.record.force < context.peak_force, recovery(context.load_share), 0.0)
-    return replace(context, recoverable=recoverable, displacement=reached - recoverable * share)
+    return replace(context, recoverable=recoverable, displacement=peak - recoverable * share)
 
 
 def additions(effects: Effects, memory: Memory, context: Context) -> tuple[tuple[Any, ...], tuple[Any, ...], Path]:
     """The effects' memories after a path under load control, what drove them last, and what is added along it [um]."""
-    record = context.record
-    seconds = jnp.diff(record.time, prepend=memory.point.time)
-
-    def remember(effect: AbstractEffect, own: Any, driven: Scalar) -> tuple[Any, Any, Scalar]:
-        along = effect.driver(context)
-        earlier = jnp.concatenate([jnp.broadcast_to(driven, (1,)), along[:-1]])
-        own, value = jax.lax.scan(lambda past, now: effect.evolve(past, *now), own, (earlier, along, seconds))
-        return own, value, along[-1]
-
-    own, drivers, values = _remember(effects, memory, remember)
-    return own, drivers, _added(effects, context, values)
+    seconds = jnp.diff(context.record.time, prepend=memory.point.time)
+    memories, drivers, total = [], [], jnp.zeros_like(context.displacement)
+    for effect, own, driver in zip(effects, memory.of_effects, memory.drivers, strict=True):
+        seen = None
+        if own is not None:
+            along = effect.driver(context)
+            earlier = jnp.concatenate([jnp.broadcast_to(driver, (1,)), along[:-1]])
+            own, seen = jax.lax.scan(
+                lambda past, now, effect=effect: effect.evolve(past, *now), own, (earlier, along, seconds)
+            )
+            driver = along[-1]
+        if effect.overrides("inside", "observe"):
+            own_context = replace(context, memory=seen)
+            total = total + effect.inside(own_context) + effect.observe(own_context)
+        memories.append(own)
+        drivers.append(driver)
+    return tuple(memories), tuple(drivers), total
 
 
 def force_at(
@@ -204,14 +196,84 @@ def force_at(
     return root + jnp.where(touches, change, 0.0)
 
 
+# ---- virgin loading whose three terms carry factors that depend on strain and rate -----------------------------------
+
+
+def strain_under(effects: Effects, law: Formulas, particle: Particle, record: Record, stress: Path) -> Path:
+    r"""Strain of virgin loading at a stress [MPa] when effects change the loading curve; 0 at and below zero.
+
+    Solves :math:`f_1 K_1 x - f_3 K_3 x^3 + f_5 K_5 x^5 = \sigma`, :math:`x = \eta_p \epsilon`, with factors
+    :math:`f_j(\epsilon)`: the base law's inverse with the factors at its own strain, then Newton's method. Derivatives
+    follow from the implicit-function rule, as one Newton step from the frozen root is differentiated.
+    """
+    target = jnp.where(stress >= 0, stress, 0.0)
+    fixed = jax.tree.map(jax.lax.stop_gradient, (effects, law, particle, record))
+    law_there, particle_there, target_there = *fixed[1:3], jax.lax.stop_gradient(target)
+
+    def factors(strain: Path) -> list[Factors]:
+        return [effect.loading(*fixed[1:], strain) for effect in fixed[0]]
+
+    def with_slopes(strain: Path) -> tuple[list[Factors], list[Factors]]:
+        return jax.jvp(factors, (strain,), (jnp.ones_like(strain),))
+
+    def newton(_: Any, strain: Path) -> Path:
+        return newton_step(law_there, particle_there, target_there, strain, *with_slopes(strain))
+
+    start = base_strain(law_there, particle_there, target_there)
+    start = base_strain(law_there, particle_there, target_there, factors(start))
+    # Written out, the steps would multiply what is to be compiled.
+    root = jax.lax.fori_loop(0, NEWTON_STEPS, newton, start)
+    residual = stress_at(law, particle, root, [e.loading(law, particle, record, root) for e in effects]) - target
+    return root - residual / slope_at(law_there, particle_there, root, *with_slopes(root))
+
+
+def stress_at(law: Formulas, particle: Particle, strain: Path, factors: Sequence[Factors] = ()) -> Path:
+    """Stress [MPa] of virgin loading at a strain, with the factors of effects on its three terms."""
+    return _with_factors(law, strain, factors).halley(law.shape_factor(particle) * strain)[0]
+
+
+def slope_at(
+    law: Formulas, particle: Particle, strain: Path, factors: Sequence[Factors], slopes: Sequence[Factors]
+) -> Path:
+    """Slope of `stress_at` over strain, of the factors' own slopes too; kept above a thousandth of the initial one,
+    where a curve stops being monotone."""
+    one = jnp.ones_like(strain)
+    slope = jax.jvp(lambda *at: stress_at(law, particle, *at), (strain, factors), (one, slopes))[1]
+    least = 1e-3 * law.plastic.C1 * law.shape_factor(particle)
+    return jnp.where(slope > least, slope, least)
+
+
+def base_strain(law: Formulas, particle: Particle, stress: Path, factors: Sequence[Factors] = ()) -> Path:
+    """Strain of virgin loading at a stress, with factors that do not depend on strain."""
+    curve = _with_factors(law, stress, factors)
+    return jax.vmap(reached)(curve, stress, jnp.zeros_like(stress)) / law.shape_factor(particle)
+
+
+def newton_step(
+    law: Formulas, particle: Particle, stress: Path, strain: Path, factors: Sequence[Factors], slopes: Sequence[Factors]
+) -> Path:
+    """A step of Newton's method for the strain at a stress, of at most 30 % of the strain."""
+    change = (stress - stress_at(law, particle, strain, factors)) / slope_at(law, particle, strain, factors, slopes)
+    limit = 0.3 * strain
+    return strain + jnp.where(change > limit, limit, jnp.where(change < -limit, -limit, change))
+
+
+def _with_factors(law: Formulas, like: Path, factors: Sequence[Factors]) -> Quintic:
+    K1, K3, K5 = (jnp.broadcast_to(K, like.shape) for K in law.plastic.polynomial)
+    for f1, f3, f5 in factors:
+        K1, K3, K5 = K1 * f1, K3 * f3, K5 * f5
+    return Quintic(K1, K3, K5)
+
+
+# ---- effects that are closed formulas of particle and peak -----------------------------------------------------------
+
+
 def folded(
     law: Formulas, effects: Effects, particle: Particle, what: str
 ) -> tuple[Formulas, tuple[AbstractModulusAtPeak, ...]]:
     """The law with the parameters that effects make of it for a particle, and the effects on the modulus at a peak.
 
-    Raises:
-        InputError: naming an effect that is not a closed formula of particle and peak, and `what` was wanted of the
-            law.
+    `InputError` names another effect, and `what` was wanted of the law.
     """
     at_peak = tuple(e for e in effects if isinstance(e, AbstractModulusAtPeak))
     for effect in effects:
@@ -231,26 +293,4 @@ def folded(
 
 def factor_at_peak(effects: tuple[AbstractModulusAtPeak, ...], strain: Values, stress: Values) -> Values:
     """Product of the factors of effects on the effective modulus at a peak strain [-] and a peak stress [MPa]."""
-    factor = jnp.ones_like(strain)
-    for effect in effects:
-        factor = factor * effect.factor(strain, stress)
-    return factor
-
-
-def _remember(
-    effects: Effects, memory: Memory, remember: Callable[[AbstractEffect, Any, Scalar], tuple[Any, Any, Scalar]]
-) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
-    """The effects' memories after the last point, what drove them there, and the value of each for `inside`."""
-    each = zip(effects, memory.of_effects, memory.drivers, strict=True)
-    found = [(None, None, None) if own is None else remember(effect, own, before) for effect, own, before in each]
-    own, values, drivers = zip(*found, strict=True) if found else ((), (), ())
-    return own, drivers, values
-
-
-def _added(effects: Effects, context: Context, values: tuple[Any, ...]) -> Values:
-    total = jnp.zeros_like(context.displacement)
-    for effect, value in zip(effects, values, strict=True):
-        if effect.overrides("inside", "observe"):
-            own = eqx.tree_at(lambda c: c.memory, context, value, is_leaf=lambda x: x is None)
-            total = total + effect.inside(own) + effect.observe(own)
-    return total
+    return math.prod((effect.factor(strain, stress) for effect in effects), start=jnp.ones_like(strain))

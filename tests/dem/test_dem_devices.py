@@ -6,23 +6,12 @@ import socket
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from packed import PRESSING, dense, motion, packing
 
-from mcc_jax import paper_law
-from mcc_jax.dem import (
-    Interaction,
-    Motion,
-    advance,
-    die,
-    in_single,
-    scattered,
-    spheres,
-    stable_time_step,
-    start,
-)
+from mcc_jax.dem import advance, in_single, start
 
 pytestmark = pytest.mark.extended
 
@@ -120,14 +109,9 @@ def test_two_processes_give_the_numbers_of_one():
 
 def test_single_precision_errs_as_documented():
     """Forces in float32 to about 1e-6, because places stay in float64."""
-    packing = spheres(paper_law(), jax.random.uniform(jax.random.key(1), (24,), minval=80.0, maxval=120.0))
-    position, height = scattered(jax.random.key(0), packing.radius, 2.2e-4)
-    walls = die(2.2e-4, 0.72 * height)
-    begin = start(packing, walls, position.at[:, 2].multiply(0.72), 1e-5)
-    motion = Motion.of(stable_time_step(packing), Interaction(damping=0.1, friction=0.3, wall_friction=0.3))
-    pressing = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
-    double, rows = advance(packing, motion, begin, pressing, 3, 100, 1e-5)
-    single, rows_single = advance(*in_single(packing, motion, begin), pressing, 3, 100, 1e-5)
+    begin = start(packing(), dense().walls, dense().position, 1e-5)
+    double, rows = advance(packing(), motion(), begin, PRESSING, 3, 100, 1e-5)
+    single, rows_single = advance(*in_single(packing(), motion(), begin), PRESSING, 3, 100, 1e-5)
     assert single.edges.overlap_max.dtype == single.wall_history.slip.dtype == single.velocity.dtype == jnp.float32
     assert single.position.dtype == single.walls[1].point.dtype == jnp.float64
     assert rows_single.on_wall.dtype == np.float32
@@ -136,5 +120,5 @@ def test_single_precision_errs_as_documented():
     assert 0 < np.abs(rows_single.on_wall - rows.on_wall).max() <= 5e-6 * largest
     np.testing.assert_allclose(single.position, double.position, rtol=0, atol=5e-6 * 1e-4)
     # The punch has gone as far but for the rounding of the time step, which float32 heights would not allow.
-    way = [height * 0.72 - float(state.walls[1].point[2]) for state in (double, single)]
+    way = [float(begin.walls[1].point[2] - state.walls[1].point[2]) for state in (double, single)]
     assert abs(way[1] / way[0] - 1) <= 1e-7

@@ -28,8 +28,8 @@ from mcc_jax.dem import (
     wall_force,
 )
 from mcc_jax.dem import quasistatic as quasistatic
+from mcc_jax.dem.equilibrium import Problem, balance, net_force
 from mcc_jax.dem.quasistatic import BOTTOM, TOP
-from mcc_jax.dem.stiffness import Problem, balance, net_force
 from mcc_jax.geometry import Particle
 
 LAW = paper_law()

@@ -173,9 +173,7 @@ def test_a_constant_pull_depends_on_what_the_load_has_lost():
         contact = 1 - np.asarray(recovery(carried)) ** 2
         pull = (1 - carried) * contact / (contact + 0.09)
         carried = u + k * pull
-    delta = float(
-        LAW.formulas.recoverable_displacement(PARTICLE, base(record)[49], jnp.asarray(200.0), jnp.asarray(1.0))
-    )
+    delta = float(LAW.recoverable_displacement(PARTICLE, base(record)[49], jnp.asarray(200.0), jnp.asarray(1.0)))
     np.testing.assert_allclose(pulled, delta * np.asarray(recovery(u) - recovery(carried)), rtol=1e-6)
     assert (np.diff(pull[:35]) > 0).all()
 

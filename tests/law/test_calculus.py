@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    FORMS,
     SOME_FORMS,
     all_finite,
     between,
@@ -161,23 +160,6 @@ def finite_everywhere(unloading, scaling, dtype, function):
             assert np.all(np.abs(one - other) <= accuracy * scale)
 
 
-@pytest.mark.extended
-@SOME_FORMS
-def test_value_and_derivatives_are_finite_where_branches_meet(unloading, scaling):
-    finite_everywhere(unloading, scaling, jnp.float64, along_a_path)
-
-
-@pytest.mark.extended
-@SOME_FORMS
-def test_value_and_derivatives_are_finite_in_single_precision(unloading, scaling):
-    finite_everywhere(unloading, scaling, jnp.float32, along_a_path)
-
-
-@pytest.mark.extended
-def test_value_and_derivatives_of_one_step_are_finite():
-    finite_everywhere(*FORMS[0], jnp.float64, one_step)
-
-
 def along_a_path(law, particle, state, value, load):
     """To the place, back to half of it, and there again: a reload."""
     run = law.path_load if load else law.path
@@ -189,6 +171,14 @@ def along_a_path(law, particle, state, value, load):
 def one_step(law, particle, state, value, load):
     state, response = (law.step_load if load else law.step)(particle, state, value)
     return jnp.stack([response, state.displacement_max])
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("function", [along_a_path, one_step])
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@SOME_FORMS
+def test_value_and_derivatives_are_finite_where_branches_meet(unloading, scaling, dtype, function):
+    finite_everywhere(unloading, scaling, dtype, function)
 
 
 @pytest.mark.extended

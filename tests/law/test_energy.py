@@ -21,7 +21,7 @@ from helpers import (
 )
 from hypothesis import given, settings
 
-from mcc_jax.law import Energy, History, Plastic, Unloading
+from mcc_jax.law import Energy, History, Plastic
 
 
 @eqx.filter_jit
@@ -52,7 +52,7 @@ def test_work_is_the_integral_of_force(unloading, scaling, theta, x, share):
     state = along(law, p, peak, jnp.stack([peak, end]))
     close(state.work[0], loaded, rel=1e-12)
     close(state.work[0] - state.work[1], returned, rel=1e-7, scale=1e-11 * loaded)
-    close(law.loading_work(p, peak), loaded, rel=1e-12)
+    close(law.contact(p).work(peak), loaded, rel=1e-12)
 
 
 @ALL_FORMS
@@ -77,27 +77,13 @@ def test_balance(unloading, scaling, theta, x):
     close(e.recoverable[0], 4 / (3 * np.pi) * F * recovered, rel=1e-13)
 
 
-@pytest.mark.extended
-@pytest.mark.parametrize("form", Unloading)
-def test_elastic_loop_dissipates_nothing(form):
-    law, p = paper_law(form, modulus=2000.0), paper_particle(3)
-    peak, deep = p.displacement(jnp.array(0.38)), p.displacement(jnp.array(0.376))
-    loop = jnp.concatenate(
-        [jnp.linspace(0, peak, 50), jnp.linspace(peak, deep, 2001), jnp.linspace(deep, peak, 2001)[1:]]
-    )
-    F = force_along(law, p, loop)
-    area = jnp.trapezoid(F[49:], loop[49:])
-    assert abs(area) < 1e-13 * F.max() * (peak - deep)
-    assert along(law, p, peak, peak[None]).work[0] == along(law, p, peak, peak[None]).work[0]
-
-
 def test_further_loading_counts_from_the_new_peak():
     law, p = paper_law(), paper_particle(2)
     fresh = law.energy(p, law.init(p), jnp.array(50.0))
     again = law.energy(p, History(30.0), jnp.array(50.0))
     for one, other in zip(jax.tree.leaves(fresh), jax.tree.leaves(again), strict=True):
         assert one == other
-    close(fresh.work, law.loading_work(p, jnp.array(50.0)), rel=1e-15)
+    close(fresh.work, law.contact(p).work(jnp.array(50.0)), rel=1e-15)
 
 
 @pytest.mark.extended
@@ -155,13 +141,15 @@ def test_no_work_where_the_quintic_would_pull(C3):
     found = along_peaks(law, p, peaks)
     close(found.work, work[::4000], rel=1e-6, scale=1e-12)
     assert jnp.all(jnp.diff(found.dissipated) >= -1e-12)
-    slopes = jax.vmap(jax.grad(lambda d: law.loading_work(p, d)))(peaks)
+    slopes = jax.vmap(jax.grad(lambda d: law.contact(p).work(d)))(peaks)
     close(slopes, F[::4000], scale=1e-11 * F.max())
     x = jnp.asarray(1.1)
-    exact = np.asarray(jax.jacrev(lambda K: Plastic.from_polynomial(*K).work(x))(jnp.asarray(plastic.polynomial)))
+    exact = np.asarray(jax.jacrev(lambda K: Plastic.from_polynomial(*K).curve.work(x))(jnp.asarray(plastic.polynomial)))
     for k in range(3):
         up, down = (jnp.asarray(plastic.polynomial).at[k].multiply(1 + h) for h in (1e-6, -1e-6))
-        slope = (Plastic.from_polynomial(*up).work(x) - Plastic.from_polynomial(*down).work(x)) / (up[k] - down[k])
+        slope = (Plastic.from_polynomial(*up).curve.work(x) - Plastic.from_polynomial(*down).curve.work(x)) / (
+            up[k] - down[k]
+        )
         close(exact[k], slope, rel=2e-5)
 
 

@@ -160,9 +160,6 @@ def test_history_is_what_was_reached():
     state, force = law.step(p, History(7.0), jnp.array(3.0))
     assert state.displacement_max == 7
     assert force == 0
-    strain, stress = law.internal_variables(p, state)
-    close(strain, 7 / p.effective_diameter, rel=1e-15)
-    close(stress, law.loading_stress(p, strain), rel=1e-15)
 
 
 @pytest.mark.extended
@@ -176,17 +173,6 @@ def test_splitting_a_path_changes_nothing():
     assert end.displacement_max == state.displacement_max
     state, whole = law.path_load(p, law.init(p), whole)
     assert jnp.all(jnp.diff(whole[jnp.array([0, 1, 5, 7])]) > 0)
-
-
-@pytest.mark.extended
-def test_out_of_contact_the_displacement_stays():
-    law, p = paper_law(), paper_particle(7)
-    state = History(50.0)
-    residual = law.residual_displacement(p, state)
-    _, d = law.path_load(p, state, jnp.array([0.0, -1.0, -100.0]))
-    close(d, jnp.full(3, residual), rel=1e-14)
-    _, d = law.path_load(p, law.init(p), jnp.array([0.0, -1.0, 0.0]))
-    np.testing.assert_array_equal(d, 0)
 
 
 @pytest.mark.extended
@@ -240,11 +226,6 @@ def test_a_stiffer_particle_recovers_less_and_carries_less(theta, x, factor):
     stiff = theta * np.where(np.arange(8) == 4, factor, 1.0)
     soft_force, stiff_force = (run(t, jnp.array(0.0), path)[1] for t in (theta, stiff))
     assert jnp.all(stiff_force <= soft_force * (1 + 1e-12))
-
-
-def test_an_abstract_law_cannot_be_made():
-    with pytest.raises(TypeError, match="abstract"):
-        AbstractContactLaw()
 
 
 def test_bad_shapes_are_refused():

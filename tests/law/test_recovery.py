@@ -46,54 +46,6 @@ def shares():
     return np.concatenate([[0.0], ends, np.linspace(0.01, 0.99, 197), 1 - ends[::-1]])
 
 
-@pytest.mark.parametrize(
-    ("s", "printed"),
-    [
-        (0.0, "1"),
-        (0.1, "0.87288857157"),
-        (0.25, "0.68503764247429"),
-        (0.5, "0.391002218956"),
-        (0.7, "0.18812040437419"),
-        (2**-0.5, "0.181690113816"),
-        (0.75, "0.144293612814"),
-        (0.9, "0.0373860734685"),
-        (0.999, "3.79549743734e-5"),
-        (1.0, "0"),
-    ],
-)
-def test_stress_ratio_values(s, printed):
-    check(stress_ratio(jnp.array(s)), printed)
-
-
-def test_stress_ratio_special_values():
-    close(stress_ratio(jnp.array(0.5)), 2 / 3 - np.sqrt(3) / (2 * np.pi), rel=1e-15)
-    close(stress_ratio(jnp.sqrt(jnp.array(0.5))), 1 / 2 - 1 / np.pi, rel=2e-15)
-
-
-@pytest.mark.parametrize(
-    ("ratio", "printed"),
-    [
-        (0.01, "0.95873500358708"),
-        (0.1, "0.80538363652012"),
-        (0.25, "0.63470459397619"),
-        (0.5, "0.40397275329952"),
-        (0.75, "0.19764395315566"),
-        (0.9, "0.078620887418228"),
-        (0.99, "0.0078540623827244"),
-    ],
-)
-def test_recovery_values(ratio, printed):
-    check(recovery(jnp.array(ratio)), printed)
-
-
-@pytest.mark.parametrize(
-    ("s", "printed"),
-    [(0.0, "0.424413181578"), (0.25, "0.21399336692"), (0.5, "0.080163338233"), (0.75, "0.0145960735323")],
-)
-def test_energy_ratio_values(s, printed):
-    check(energy_ratio(jnp.array(s)), printed)
-
-
 @pytest.mark.extended
 @pytest.mark.parametrize(
     ("s", "printed"),
@@ -194,16 +146,6 @@ def test_inverse_both_ways(r, s):
     # s from f loses what f' = -(4/pi) sqrt(1 - s^2) lacks near s = 1.
     back = f_inverse(f(jnp.array([s])))
     close(back, np.array([s]), scale=4e-16 + 1e-15 * (1 - s))
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(s=st.floats(0, 1), t=st.floats(0, 1))
-def test_falls_from_one_to_zero(s, t):
-    low, high = sorted([s, t])
-    at_low, at_high = f(jnp.array([low, high]))
-    assert 0 <= at_high <= at_low + 4.5e-16 <= 1 + 4.5e-16
-    more, less = g(jnp.array([low, high]))
-    assert 0 <= less <= more * (1 + 1e-15)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

@@ -47,32 +47,20 @@ def balance(law, particle, strain):
 
 @pytest.mark.extended
 @ALL_FORMS
-@pytest.mark.parametrize("modulus", [1.0, 30.0, 400.0, 16000.0])
-def test_what_is_lost_never_falls_as_the_peak_grows(unloading, scaling, modulus):
-    """At every peak from 1e-9 to four times the tested range, for moduli down to a fraction of the stress itself."""
-    law = paper_law(unloading, scaling, modulus=modulus)
-    strain = jnp.geomspace(1e-9, 4 * 0.67, 2000)
-    for number in (1, 6):
-        lost, slope, residual = balance(law, paper_particle(number), strain)
-        assert jnp.all(lost > 0)
-        assert jnp.all(slope > -1e-12)
-        assert jnp.all(residual > -1e-15)
+@pytest.mark.parametrize("modulus", [0.3, 1.0, 30.0, 400.0, 16000.0])
+@pytest.mark.parametrize("softening", [0.0, 0.5, 1.0, 1.5])
+def test_what_is_lost_never_falls_as_the_peak_grows(unloading, scaling, modulus, softening):
+    """From 1e-9 to four times the tested range, for soft moduli, and for curves that fall (9 C3^6 / (20 C1 C5^5) > 1).
 
-
-@pytest.mark.extended
-@pytest.mark.parametrize("softening", [0.0, 0.5, 0.98, 1.0, 1.5])
-def test_so_it_is_for_any_softening(softening):
-    """9 C3^6 / (20 C1 C5^5) up to the loss of monotony and beyond, where force follows the curve down."""
+    Where the curve falls, what is lost grows while force is given back.
+    """
     C1, C5 = 7.0, 2.7
     plastic = Plastic(C1, (softening * 20 / 9 * C1 * C5**5) ** (1 / 6), C5)
-    for form in Unloading:
-        for modulus in (0.3, 3.0, 30.0, 300.0):
-            law = paper_law(form, modulus=modulus, plastic=plastic)
-            lost, slope, residual = balance(law, paper_particle(3), jnp.geomspace(1e-9, 2.0, 2000))
-            # Where the curve falls, what is lost grows while force is given back.
-            assert jnp.all(lost > 0)
-            assert jnp.all(slope > -1e-12)
-            assert jnp.all(residual > -1e-15)
+    law = paper_law(unloading, scaling, modulus=modulus, plastic=plastic)
+    lost, slope, residual = balance(law, paper_particle(6), jnp.geomspace(1e-9, 4 * 0.67, 2000))
+    assert jnp.all(lost > 0)
+    assert jnp.all(slope > -1e-12)
+    assert jnp.all(residual > -1e-15)
 
 
 @pytest.mark.extended
