@@ -130,7 +130,9 @@ def _as_input_error(directory: Path, error: BaseException) -> BaseException:
     """The error for the user, who knows the folder but not the stage."""
     if isinstance(error, InputError):
         return error.changed(file=directory) if WORK in str(error.file) else error
-    if not isinstance(error, OSError) or error.errno not in _CANNOT_WRITE:
+    if not isinstance(error, OSError):
+        return error
+    if error.errno not in _CANNOT_WRITE and Path(str(error.filename)) not in (directory, *directory.parents):
         return error
     why = error.strerror or str(error)
     if error.errno == errno.EISDIR:

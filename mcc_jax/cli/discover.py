@@ -89,7 +89,7 @@ def discover(
         data = read_without(campaign, options["leave_out"], progress)
         parts = {"experiments": not no_experiments, "posterior": not no_posterior}
         origin = provenance("discover", campaign, options | {"held_out": not no_held_out} | parts)
-        chosen = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")} | parts
+        chosen: dict[str, Any] = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")} | parts
         with results(out) as stage:
             found = find(data, model=joint_model(options), confirm=not no_held_out, progress=progress, **chosen)
             content = write_discovery(found, stage, origin=origin, figures=not no_figures, progress=progress)

@@ -57,7 +57,7 @@ class Stop(click.ClickException):
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
-        self.exit_code = status
+        self.exit_code = status  # pyright: ignore[reportAttributeAccessIssue]  # click's own errors share theirs
 
     def show(self, file: Any = None) -> None:
         """Print the line."""

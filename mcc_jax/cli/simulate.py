@@ -273,8 +273,9 @@ def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> N
     durations = moving * peaks + holding
     if not durations.max() < LONGEST_S:
         raise InputError(f"a test would take {durations.max():.4g} s", file=file, remedy="Give a higher rate")
-    samples = np.ceil(durations / programme.interval_s) if programme.interval_s else programme.points
-    rows, steps = np.broadcast_to(samples, peaks.shape), len(programme.steps)
+    rows, steps = np.full(peaks.shape, programme.points or 0.0), len(programme.steps)
+    if programme.interval_s:
+        rows = np.ceil(durations / programme.interval_s)
     if np.sum(rows + steps) > MAX_ROWS or rows.max() * steps > 10 * MAX_ROWS:
         problem = f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points"
         raise InputError(problem, file=file, remedy="Take fewer points, a longer interval or a higher rate")
@@ -303,7 +304,7 @@ def _campaign(
         force_resolution_mN=options["resolution_mN"],
         zero_um=options["zero_um"],
     )
-    extreme = "Choose less extreme values"
+    humidity = humidity_column(sizes.names, sizes.columns, str(sizes.file or "")) if effects else None
     try:
         campaign = simulate_campaign(
             laws,
@@ -313,7 +314,7 @@ def _campaign(
             instrument=instrument,
             particles=sizes.names,
             effects=effects,
-            relative_humidity_percent=humidity_column(sizes.names, sizes.columns, "") if effects else None,
+            relative_humidity_percent=humidity,
             seed=options["seed"],
             provenance=f"simulated by mcc-jax simulate, seed {options['seed']}; not a measurement",
         )
@@ -321,4 +322,5 @@ def _campaign(
         return check_campaign(campaign, file="")
     except ValueError as error:
         problem = error.problem if isinstance(error, InputError) else str(error)
-        raise InputError(problem, file=options["programme"] or sizes.file, remedy=extreme) from error
+        remedy = "Choose less extreme values"
+        raise InputError(problem, file=options["programme"] or sizes.file, remedy=remedy) from error

@@ -110,7 +110,7 @@ def plot_ranking(found: Discovery) -> Figure:
     ax = figure.subplots()
     column: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
     scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
-    kinds = {
+    kinds: dict[str, style.Look] = {
         "added to the law": {"color": style.BLUE},
         "explains it as well": {"color": style.SKY},
         "others": {"color": style.PALE},
@@ -142,8 +142,8 @@ def plot_ranking(found: Discovery) -> Figure:
     header: style.Look = {"transform": ax.transAxes, "va": "bottom", "fontsize": 8, "color": style.GREY}
     ax.text(1.1, 1.0, "probability", ha="right", **header)
     ax.text(1.13, 1.0, "estimate and detection limit", **header)
-    handles: list[Line2D | Patch] = [Patch(label=kind, **look) for kind, look in kinds.items() if kind in seen]
-    handles.append(Line2D([], [], label="detection limit", **_FLOOR))
+    handles = [Patch(label=kind, **look) for kind, look in kinds.items() if kind in seen]
+    handles = [*handles, Line2D([], [], label="detection limit", **_FLOOR)]
     title = "What could be missing: no gap was found" if found.verdict == "NO_GAP" else "What explains the gap"
     return _finished(figure, found, title=title, handles=handles)
 

@@ -292,7 +292,7 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
     ax.plot(master.mean, master.stress_MPa, markevery=step, label="sample mean", **_MEAN)
     law: style.Look = {"color": style.VERMILION, "linewidth": 1.0}
-    ax.plot(x, mean, label="mean law", **law | {"linewidth": 1.6})
+    ax.plot(x, mean, color=style.VERMILION, linewidth=1.6, label="mean law")
     ax.plot(x, mean + sd, label="± 1 sd of stress", dashes=(4, 2), **law)
     ax.plot(x, np.maximum(mean - sd, 0.0), dashes=(4, 2), **law)
     ax.plot(x, float(plastic.C1) * x, color=style.GREY, linewidth=1.1, dashes=(5, 1.5, 1, 1.5), label="first term only")

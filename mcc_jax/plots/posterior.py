@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from arviz_stats.base.array import array_stats
@@ -69,7 +69,7 @@ def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
 # ---- the population --------------------------------------------------------------------------------------------------
 
 
-def _scaled(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _scaled(named: dict[str, Any]) -> dict[str, Any]:
     """Draws in the order and the units of the figures."""
     factors = {"effective_modulus_MPa": 1e-3}
     return {name: named[name] * factors.get(name, 1.0) for name in LABELS if name in named}

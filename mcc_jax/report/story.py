@@ -77,8 +77,8 @@ def example_of(results: Results, shown: Sequence[FittedCurve]) -> Example | None
     one = max(known, key=lambda one: one.rms_um or 0.0)
     worst = f"of all particles the one that the law misses most, by {number(one.rms_um, 2)} µm on average"
     caption = f"Particle {one.name} with its own curve of loading: {worst}."
-    columns = (one.time_s, one.force_mN, one.displacement_um, one.displacement_um - one.own_um)
-    return Example(*(column[one.used] for column in columns), caption)
+    used, away = one.used, one.displacement_um - one.own_um
+    return Example(one.time_s[used], one.force_mN[used], one.displacement_um[used], away[used], caption)
 
 
 def most_informative_test(found: Discovery) -> Example | None:
@@ -109,10 +109,18 @@ def most_informative_test(found: Discovery) -> Example | None:
         which = "gains most"
     shown = f"particle {campaign.particles[i]}, which of {len(before)} particles {which}"
     caption = f"Shown: {shown}. On average the law is off by {off}.{source}"
-    measured = (column[rows] for column in (curve.time_s, curve.force_mN, curve.displacement_um))
     one, two, noise = (column[j, : len(used)][used] for column in (before, after, left.noise))
-    more = {"after_um": two, "added": f"law with {name}"} if added else {}
-    return Example(*measured, one, caption, noise_um=noise, simulated=is_simulated(campaign.metadata), **more)
+    return Example(
+        curve.time_s[rows],
+        curve.force_mN[rows],
+        curve.displacement_um[rows],
+        one,
+        caption,
+        two if added else None,
+        noise,
+        f"law with {name}" if added else "",
+        is_simulated(campaign.metadata),
+    )
 
 
 # ---- its pictures ----------------------------------------------------------------------------------------------------

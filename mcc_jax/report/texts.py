@@ -26,7 +26,7 @@ METHODS = {
 }
 SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
 GREEK_NAMES = ("sigma", "eps", "tau", "eta", "kappa", "gamma", "mu", "alpha", "phi", "pi", "Delta")
-GREEK = dict(zip(GREEK_NAMES, "σετηκγμαφπΔ", strict=True))
+GREEK: dict[str, str] = dict(zip(GREEK_NAMES, "σετηκγμαφπΔ", strict=True))
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
 
 
