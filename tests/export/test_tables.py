@@ -2,12 +2,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import PARTICLE
 from helpers import FORMS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcc_jax import InputError, MccLaw, Particle, Plastic, drive, paper_law
-from mcc_jax.export import curve_tables, golden_table
+from mcc_jax.export import curve_tables, golden_table, write_export
 
 TOLERANCE = 1e-5
 numbers = st.tuples(
@@ -38,22 +39,24 @@ def test_linear_interpolation_is_within_the_stated_error(drawn):
     assert np.abs(np.interp(x, at.index, at[column]) - want).max() <= TOLERANCE * at[column].max()
 
 
-@pytest.mark.parametrize(
-    ("form", "modulus"), [(FORMS[0], 16000.0), (FORMS[3], 1e4), (FORMS[6], 100.0), (FORMS[8], 3.0)]
-)
-@pytest.mark.parametrize("D3", [150.0, 230.0])
-def test_recovered_strain_of_any_shape(form, modulus, D3):
-    """From the formula's column and its limit, as `master_curve.json` says: flat and upright particles, any peak."""
-    law, particle = paper_law(*form), Particle(213.54, 196.07, D3)
-    law = MccLaw(law.plastic, law.a, modulus, *form)
-    eta, table = float(law.shape_factor(particle)), curve_tables(law).loading
-    peak = 0.67 / eta * np.random.default_rng(1).uniform(0, 1, 4000) ** 4
+def interpolated(table, law, eta, peak):
+    """Stress, and scaled strain recovered, from scaled peak strains, as `master_curve.json` says."""
     stress, tangent, formula = (
-        np.interp(eta * peak, table["scaled_strain"], table[name])
+        np.interp(peak, table["scaled_strain"], table[name])
         for name in ("stress_MPa", "tangent_MPa", "recovered_strain_formula_at_eta_1")
     )
-    delta = np.minimum(formula * eta ** ((1 - form[1].power) / 2), peak)
-    delta = np.minimum(delta, 3 * np.pi / 8 * stress / (eta * tangent))
+    delta = eta * eta ** ((1 - law.strain_scaling.power) / 2) * formula
+    return stress, np.minimum(delta, np.minimum(peak, 3 * np.pi / 8 * stress / tangent))
+
+
+@pytest.mark.parametrize(("form", "modulus"), [(FORMS[0], 16e3), (FORMS[3], 1e4), (FORMS[6], 100.0), (FORMS[8], 3.0)])
+@pytest.mark.parametrize("D3", [150.0, 230.0])
+def test_recovered_strain_of_any_shape(form, modulus, D3):
+    """From the formula's column and its limit: flat and upright particles, any peak."""
+    law, particle = MccLaw(paper_law().plastic, 1.43, modulus, *form), Particle(213.54, 196.07, D3)
+    eta = float(law.shape_factor(particle))
+    peak = 0.67 / eta * np.random.default_rng(1).uniform(0, 1, 4000) ** 4
+    delta = interpolated(curve_tables(law).loading, law, eta, eta * peak)[1] / eta
     want = np.asarray(law.recoverable_strain(particle, jnp.asarray(peak)))
     assert np.abs(delta - want).max() <= 3e-5 * want.max()
 
@@ -70,16 +73,11 @@ def assert_rebuilt(law, particle, tables):
     golden = golden_table(law, particle)
     eta, diameter = float(law.shape_factor(particle)), float(particle.effective_diameter)
     x, peak = eta * golden["displacement_um"] / diameter, eta * golden["displacement_max_um"] / diameter
-    loading, unloading = tables.loading, tables.unloading
-
-    def at(column, where):
-        return np.interp(where, loading["scaled_strain"], loading[column])
-
-    delta = eta * eta ** ((1 - law.strain_scaling.power) / 2) * at("recovered_strain_formula_at_eta_1", peak)
-    delta = np.minimum(delta, np.minimum(peak, 3 * np.pi / 8 * at("stress_MPa", peak) / at("tangent_MPa", peak)))
+    peak_stress, delta = interpolated(tables.loading, law, eta, peak)
+    unloading = tables.unloading
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(x < peak, (peak - x) / delta, 0.0)
-    stress = at("stress_MPa", peak) * np.interp(share, unloading["recovered_share"], unloading["stress_share"])
+    stress = peak_stress * np.interp(share, unloading["recovered_share"], unloading["stress_share"])
     force = stress * float(particle.effective_area) * 1e-3
     assert np.abs(force - golden["force_mN"]).max() <= 2e-4 * golden["force_mN"].max()
 
@@ -96,7 +94,7 @@ def test_a_curve_with_a_corner_is_refused():
 
 
 def test_golden_table_is_the_law_driven_along_its_paths():
-    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    law, particle = paper_law(), PARTICLE
     table = golden_table(law, particle, seed=3)
     for _, path in table.groupby("path"):
         force = drive(law, particle, jnp.asarray(path["displacement_um"].to_numpy())).force
@@ -111,7 +109,7 @@ def test_golden_table_is_the_law_driven_along_its_paths():
 
 
 def test_golden_tangents_are_difference_quotients_away_from_the_kinks():
-    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    law, particle = paper_law(), PARTICLE
     table = golden_table(law, particle)
     down = table[(table["displacement_um"] < table["displacement_max_um"] - 1e-3) & (table["force_mN"] > 1e-3)]
     h = 1e-5
@@ -125,7 +123,7 @@ def test_golden_tangents_are_difference_quotients_away_from_the_kinks():
 
 
 def test_seed_and_units():
-    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    law, particle = paper_law(), PARTICLE
     ours, si, other = (golden_table(law, particle, **kind) for kind in ({}, {"units": "SI"}, {"seed": 1}))
     assert ours.equals(golden_table(law, particle))
     assert not ours.equals(other)
@@ -138,9 +136,7 @@ def test_seed_and_units():
 
 
 def test_every_digit_survives_the_file(tmp_path):
-    from mcc_jax.export import write_export
-
-    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    law, particle = paper_law(), PARTICLE
     write_export("json", law, particle, tmp_path)
     text = (tmp_path / "parameters_golden.csv").read_text().splitlines()
     table = golden_table(law, particle)
