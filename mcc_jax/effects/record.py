@@ -135,9 +135,9 @@ def clean_record(
     """
     force, time = arguments.path(force, "force"), arguments.path(time, "time")
     arguments.same_length(force=force, time=time)
-    if before is None:
-        humidity = None if relative_humidity is None else scalar(relative_humidity)
-        before = eqx.tree_at(lambda r: r.time, first_point(force.dtype, humidity), time[0])
+    humidity = None if relative_humidity is None else scalar(relative_humidity)
+    virgin = eqx.tree_at(lambda r: r.time, first_point(force.dtype, humidity), time[0])
+    start = virgin if before is None else before
     highest = jnp.zeros_like(force[0]) if peak_force is None else peak_force
 
     def one(carry, now):
@@ -145,10 +145,10 @@ def clean_record(
         point = follow(point, peak, *now)
         return (point, jnp.maximum(peak, point.force)), point
 
-    _, points = jax.lax.scan(one, (before, highest), (force, time))
+    _, points = jax.lax.scan(one, (start, highest), (force, time))
     # The programme of the test is data: derivatives by force act through the law, not through where the branches begin.
     points = eqx.tree_at(lambda r: (r.force, r.time), jax.lax.stop_gradient(points), (force, time))
-    return eqx.tree_at(lambda r: r.relative_humidity, points, before.relative_humidity)
+    return eqx.tree_at(lambda r: r.relative_humidity, points, start.relative_humidity)
 
 
 class Context(eqx.Module):
