@@ -247,7 +247,7 @@ def test_not_monotone_particles_are_named():
     pack = spheres(laws, jnp.full(300, 100.0))
     flagged = not_monotone(pack)
     assert 0 < flagged.sum() < 30
-    np.testing.assert_array_equal(flagged, ~np.asarray(laws.is_monotone))
+    np.testing.assert_array_equal(flagged, ~np.asarray(jax.vmap(lambda law: law.is_monotone)(laws)))
     assert not not_monotone(packing()).any()
     soft = sides_of(pack.sides, np.flatnonzero(flagged))  # no unique split, but numbers
     force = jax.vmap(pair_force)(soft, soft, jnp.zeros_like(soft.k1), 2 * soft.tested)
