@@ -1,4 +1,4 @@
-"""Explicit motion of a packing between walls: one step, many steps, neighbour lists made anew as needed; precision."""
+"""Explicit motion of a packing between walls: one step, many steps, neighbour lists renewed as needed; precision."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Trajectory(NamedTuple):
 def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = contact_forces) -> tuple[State, Forces]:
     """One step of the symplectic Euler rule (leapfrog): forces, then velocities, then positions and walls.
 
-    The list of edges is taken as it is; `advance` makes it anew in time. `contacts` computes the forces.
+    The list of edges is taken as it is; `advance` renews it in time. `contacts` computes the forces.
     """
     forces, edges, history = contacts(packing, motion, state)
     dt = motion.time_step
@@ -199,8 +199,8 @@ def replay(
 ) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
-    A gradient through thousands of steps is exact for that trajectory and says little about compaction: rearrangements
-    are chaotic (see `compact`).
+    A gradient through thousands of steps is exact for that trajectory, and of little use for compaction, because
+    rearrangements are chaotic (see `compact`).
 
     Args:
         packing, motion: as in `advance`.

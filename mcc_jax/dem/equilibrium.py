@@ -219,7 +219,7 @@ class _State(eqx.Module):
     energy: Scalar
     slope: Scalar
     first: Flag
-    settled: Flag
+    converged: Flag
     stuck: Flag
     at: Balance
 
@@ -244,7 +244,7 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
         return jnp.max(jnp.abs(y))
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """Nothing is known yet: the first step evaluates where it stands."""
+        """Nothing is known yet: the first step evaluates the start."""
         zero, no = jnp.zeros((), f_struct.dtype), jnp.array(False)
         at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
         return _State(y, jnp.zeros_like(y), zero + 1, zero, zero, jnp.array(True), no, no, at)
@@ -255,12 +255,12 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
         largest = jnp.max(jnp.abs(at.net))
         slope_there = -jnp.sum(at.net * state.direction)
         descends = energy - state.energy <= SUFFICIENT * state.size * state.slope
-        # Close to the minimum the energy has no digits left to tell a step by; its slope has.
+        # Close to the minimum the energy has no digits left to judge a step by; its slope has.
         level = jnp.abs(energy - state.energy) <= 1e-12 * jnp.abs(state.energy)
         accept = state.first | descends | (level & (jnp.abs(slope_there) <= 0.9 * jnp.abs(state.slope)))
-        settled = accept & (largest <= self.rtol * at.scale + self.atol)
+        converged = accept & (largest <= self.rtol * at.scale + self.atol)
         direction = jax.lax.cond(
-            accept & ~settled, lambda: _direction(at, self.reach), lambda: jnp.where(settled, 0.0, state.direction)
+            accept & ~converged, lambda: _direction(at, self.reach), lambda: jnp.where(converged, 0.0, state.direction)
         )
         secant = state.slope / jnp.minimum(state.slope - slope_there, -jnp.finfo(energy.dtype).tiny)
         size = jnp.where(accept, 1.0, state.size * jnp.clip(secant, 0.1, 0.5))
@@ -272,7 +272,7 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
             jnp.where(accept, energy, state.energy),
             jnp.where(accept, -jnp.sum(at.net * direction), state.slope),
             jnp.array(False),
-            settled,
+            converged,
             ~accept & (size < 1e-10) | ~jnp.isfinite(largest),
             jax.tree.map(lambda now, before: jnp.where(accept, now, before), at, state.at),
         )
@@ -281,7 +281,7 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
     def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Flag, optx.RESULTS]:
         """Whether the net force is small enough, or no step helps any more."""
         result = optx.RESULTS.where(state.stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
-        return state.settled | state.stuck, result
+        return state.converged | state.stuck, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Vectors, Balance, dict[str, Any]]:
         """The balance is that of the centres returned, also where the last trial was not taken."""

@@ -101,7 +101,7 @@ def half_contact(law: MccLaw, particle: Particle, normal: Float[Array, " 3"] | N
 
     with the semi-axes a, b, c = D1/2, D2/2, D3/2, and :math:`\sigma, \delta` of the law (its `a` is :math:`a_s`). R_e
     is the radius of Gaussian curvature of the ellipsoid where its tangent plane has that normal. Along e3 this is the
-    paper's particle exactly; in other directions it is a generalisation of our own that no test supports yet.
+    paper's particle exactly; in other directions it is our own generalisation, which no test supports yet.
 
     Effects on parameters (size, shape) take the particle as it is tested, along D3; those on the modulus take strain
     and stress of this side at its own peak.
@@ -320,7 +320,7 @@ def _solve(i: Contact, j: Contact, overlap: Scalar) -> _Series:
     whole = jnp.where(overlap > 0, overlap, 0.0)
     # A barrier closes the iteration, here and within: without, XLA iterates again for each use.
     d = jax.lax.optimization_barrier(_split(i, j, whole))
-    # One more step, on both sides separately: beside a side much stiffer, what is left of the overlap has no digits.
+    # One more step, on both sides separately: next to a much stiffer side, what is left of the overlap has no digits.
     rest = whole - d
     force_i, force_j = i.loading(d), j.loading(rest)
     t_i, t_j = _tangent(i, d), _tangent(j, rest)
@@ -369,12 +369,12 @@ def _halley_step(i: Contact, j: Contact, whole: Scalar, bracket: _Bracket) -> _B
     excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
     low = jnp.where(excess < 0, d, low)
     high = jnp.where(excess > 0, d, high)
-    settled = jnp.abs(excess) <= 4 * jnp.finfo(d.dtype).eps * (jnp.abs(force_i) + jnp.abs(force_j))
+    meets = jnp.abs(excess) <= 4 * jnp.finfo(d.dtype).eps * (jnp.abs(force_i) + jnp.abs(force_j))
     square = slope * slope
     divisor = jnp.maximum(square - excess * bend, 0.5 * square)
     new = d - recompute(excess * slope / jnp.where(divisor > 0, divisor, 1.0))
     new = jnp.where((new < low) | (new > high) | (divisor <= 0), 0.5 * (low + high), new)
-    new = jnp.where(settled, d, new)
+    new = jnp.where(meets, d, new)
     # The method cubes the error: after a step of 1e-5 of the smaller side only rounding is left.
     least = 1e-5 * jnp.minimum(new, whole - new) + 2 * jnp.finfo(d.dtype).eps * whole
     return _Bracket(jnp.where(jnp.abs(new - d) > least, -new, new), low, high)

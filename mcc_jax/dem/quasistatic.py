@@ -107,7 +107,7 @@ class Compaction(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """One load step; it is complete if it settled with the weakest springs."""
+    """One load step; it is complete if it converged with the weakest springs."""
 
     state: State
     equilibrium: Equilibrium
@@ -151,7 +151,7 @@ def compact(
     .. math:: f(x; \max(\delta_P, \delta(x))) - \mu (x - x_{prev}) = 0, \qquad
         \delta_P \leftarrow \max(\delta_P, \delta(x))
 
-    In every load step the centres settle where the contact forces f balance but for the proximal springs mu, which are
+    In every load step the centres come to where the contact forces f balance but for the proximal springs mu, which are
     made weaker in turn (`Solver.springs`); contacts remember only what they are at the end of the step (backward
     Euler). So each load step is a minimum of the energy of contacts and springs. A step that does not converge is
     halved; one that still does not is taken as far as it got and its row is marked, as are rows of springs not as weak

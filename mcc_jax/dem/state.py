@@ -90,10 +90,10 @@ def scattered(
     centres = np.concatenate([np.column_stack([layer, np.full(len(layer), (k + 0.5) * pitch)]) for k in range(layers)])
     order, shake = jax.random.split(key)
     place = jnp.asarray(centres)[jax.random.permutation(order, len(centres))[: len(radius)]]
-    # A sphere may move by half of what is left between it and the largest there could be beside it.
-    room = jnp.maximum(0.5 * pitch - radius - 0.5 * gap * largest, 0.0) / math.sqrt(3)
+    # A sphere may move by half of what is left between it and the largest there could be next to it.
+    length = jnp.maximum(0.5 * pitch - radius - 0.5 * gap * largest, 0.0) / math.sqrt(3)
     shift = jax.random.uniform(shake, place.shape, minval=-1.0)
-    return place + jax.vmap(jnp.multiply)(shift, room), layers * pitch
+    return place + jax.vmap(jnp.multiply)(shift, length), layers * pitch
 
 
 def relative_density(packing: Packing, radius: float, bottom: float, top: float) -> float:
@@ -174,14 +174,13 @@ def rebuild_list(packing: Packing, state: State, skin: float, capacity: int | No
     if capacity is not None:
         capacity = arguments.whole(capacity, "capacity")
     pairs = close_pairs(np.asarray(state.position, float), np.asarray(packing.radius, float), skin)
-    room = state.edges.capacity if capacity is None else capacity
-    if capacity is None and len(pairs) > room:
-        room = 64 * math.ceil(SPARE * len(pairs) / 64 + 1)
-    fresh = list_edges(pairs, len(state.position), room, state.edges.overlap_max.dtype)
+    length = state.edges.capacity if capacity is None else capacity
+    if capacity is None and len(pairs) > length:
+        length = 64 * math.ceil(SPARE * len(pairs) / 64 + 1)
+    fresh = list_edges(pairs, len(state.position), length, state.edges.overlap_max.dtype)
     if bool(fresh.overflow):
-        raise InputError(
-            f"{len(pairs)} pairs do not fit into a list of {room} edges", remedy="Take a larger `capacity`."
-        )
+        problem = f"{len(pairs)} pairs do not fit into a list of {length} edges"
+        raise InputError(problem, remedy="Take a larger `capacity`.")
     if state.edges.capacity:
         fresh = carry_history(state.edges, fresh)
     return replace(state, edges=fresh, listed_at=state.position, skin=jnp.asarray(skin, state.skin.dtype))
@@ -216,7 +215,7 @@ def check_packing(packing: Packing) -> None:
 
 
 def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
-    """Which particles soften until their force falls; the split of their contacts is not unique. Draw them anew."""
+    """Which particles soften until their force falls; the split of their contacts is not unique. Draw them again."""
     return ~np.asarray(jax.vmap(lambda side: side.is_monotone)(packing.sides))
 
 

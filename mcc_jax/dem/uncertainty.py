@@ -1,4 +1,4 @@
-"""What a compaction curve says of the particles, and back: sensitivities, a band around it, parameters from it."""
+"""Sensitivities of a compaction curve to the particles, a band around it, parameters from it."""
 
 from __future__ import annotations
 
@@ -268,7 +268,7 @@ def band_by_draws(
     draws = _checked(draws, probability)
     packings = [packing_of(jnp.asarray(values)) for values in draws]
     every = [compact(packing, state, heights, solver)[1] for packing in packings]
-    # A row that did not settle hands its history on.
+    # A row that did not converge hands its history on.
     forces = np.stack([np.where(np.logical_and.accumulate(rows.converged), rows.top, np.nan) for rows in every])
     rows = every[0]
     used = np.isfinite(forces).sum(axis=0)
@@ -356,16 +356,16 @@ def fit_compaction(
         )
     if not measured.max() > 0:
         raise InputError("a compaction curve without a positive force", remedy="Forces are in newtons.")
-    target, settled, rounds = jnp.asarray(measured), False, 0
-    while not settled and rounds < ROUNDS:
+    target, stays, rounds = jnp.asarray(measured), False, 0
+    while not stays and rounds < ROUNDS:
         tape: list[LoadStep] = []
         compact(packing_of(values), state, heights, solver, tape)
         before, rounds = values, rounds + 1
         values = _least_squares(packing_of, values, state, stacked(tape), target, solver, tolerance)
-        settled = bool(jnp.all(jnp.abs(values - before) <= 10 * tolerance * (1 + jnp.abs(values))))
+        stays = bool(jnp.all(jnp.abs(values - before) <= 10 * tolerance * (1 + jnp.abs(values))))
     _, rows = compact(packing_of(values), state, heights, solver)
     misfit = float(np.sqrt(np.mean(((rows.top - measured) / measured.max()) ** 2)))
-    return CompactionFit(np.asarray(values), rows, misfit, rounds, settled and bool(rows.converged.all()))
+    return CompactionFit(np.asarray(values), rows, misfit, rounds, stays and bool(rows.converged.all()))
 
 
 @eqx.filter_jit

@@ -197,7 +197,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     # ---- force and displacement --------------------------------------------------------------------------------------
 
     def init(self, particle: Particle, relative_humidity: Scalar | None = None) -> History:
-        """A virgin particle at the beginning of its test; relative humidity [%] of the room, the reference if None."""
+        """A virgin particle at the beginning of its test; relative humidity [%], the reference if None."""
         zero = jnp.zeros_like(particle.D3)
         return History(zero, initial_memory(self.effects, zero, relative_humidity) if self.effects else None)
 
