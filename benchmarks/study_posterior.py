@@ -27,7 +27,7 @@ import numpy as np
 
 from mcc_jax import HiddenEffect
 from mcc_jax.calibrate import LogNormalPrior, Model, NakagamiPrior, NormalPrior, Priors, sample
-from mcc_jax.calibrate.estimates import effect_numbers
+from mcc_jax.calibrate.draws import effect_numbers
 from mcc_jax.calibrate.priors import population_sites
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
 from mcc_jax.geometry import Particle

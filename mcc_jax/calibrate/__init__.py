@@ -6,9 +6,9 @@ from .campaigns import fit as fit
 from .campaigns import log_evidence as log_evidence
 from .curves import FittedCurve as FittedCurve
 from .data import select_tests as select_tests
+from .draws import Fit as Fit
 from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
-from .mode import Fit as Fit
 from .model import Model as Model
 from .paper import PaperCalibration as PaperCalibration
 from .paper import calibrate_paper as calibrate_paper

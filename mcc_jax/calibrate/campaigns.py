@@ -17,11 +17,11 @@ from .._format import described
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .compiling import one_blas_thread
+from .draws import Fit
 from .fitting import checked_settings, prepare
 from .importance import smoothed
 from .judgement import numbers_in_reach
 from .least_squares import LeastSquares, least_squares
-from .mode import Fit
 from .model import Model
 from .posterior import Posterior, sample
 

@@ -1,7 +1,8 @@
-"""The draws of a posterior by the names of its attributes: population, particles drawn back, weights, diagnostics."""
+"""The fit that samplers start from, and the draws of a posterior by the names of its attributes."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,24 +11,102 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 from numpyro.infer.util import constrain_fn
 
+from .._format import table, with_sd
+from ..arguments import is_traced
 from .compiling import compiled
 from .data import Tests
-from .estimates import effect_numbers
+from .forward import Point
 from .importance import diagnostics, sample_weighted
 from .marginal import Marginal, ParticleDraw
-from .mode import ACCEPT, Fit, LogPosterior, handlers, log_densities, populations, seeded
+from .mode import LogPosterior, handlers, log_densities, populations, seeded
 from .model import Model, coefficients
-from .noise import standard_promotion
+from .noise import NoiseFit, Whitening, standard_promotion
+from .particle_fit import ParticleFits
 from .particles import ExactLikelihood, Length, are_many, corrected, some_of, weighted
 from .population import COEFFICIENTS, Population
 
+# Acceptance that NUTS aims at. Where spreads are small the density of the population parameters is narrow (a funnel),
+# and with fewer than some ten particles the usual 0.8 lets trajectories diverge there.
+ACCEPT = 0.99
 # Of NUTS where importance sampling failed. Around its mode, in coordinates scaled by the curvature there, a density
 # that is near normal takes 15 leapfrog steps a draw; one that needs over 31 would take minutes, and shows in R-hat.
 FALLBACK_ACCEPT, TREE_DEPTH = 0.95, 5
 DEFAULT_DEPTH = 10  # NumPyro's
+
+
+class Fit(eqx.Module):
+    """Particles, noise and population of a campaign in agreement.
+
+    Attributes:
+        model: what was assumed.
+        tests: the measurements.
+        individual: every particle on its own.
+        noise: the campaign's noise.
+        filters: its filters at the point.
+        point: most probable numbers of every particle.
+        residual: measured less predicted displacement there [um], 0 where masked.
+        marginal: the tests there, with every particle's own numbers integrated out.
+        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
+        converged: for particles, noise and population in turn.
+    """
+
+    model: Model = eqx.field(static=True)
+    tests: Tests
+    individual: ParticleFits
+    noise: NoiseFit
+    filters: Whitening
+    point: Point
+    residual: Float[Array, "particles points"]
+    marginal: Marginal
+    mode: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    converged: Bool[np.ndarray, " 3"]
+
+    def __repr__(self) -> str:
+        if is_traced(self.mode):
+            return "Fit while JAX traces it"
+        sd = np.sqrt(np.diag(np.asarray(self.covariance)))
+        numbers = zip(self.names, np.asarray(self.mode), sd, strict=True)
+        rows = [(name, with_sd({"value": float(value), "sd": float(s)})) for name, value, s in numbers]
+        state = "converged" if self.converged.all() else "NOT converged"
+        effects = ", ".join(variant.label for variant in self.model.effects) or "no effects"
+        return table(f"Fit of {len(self.tests)} particles, {effects}, {state}; in unbounded coordinates", rows)
+
+    @property
+    def target(self) -> LogPosterior:
+        """The density of the population given all tests, in unbounded coordinates."""
+        return LogPosterior.of(self.model, self.marginal)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return coordinate_names(self.model)
+
+    @property
+    def population(self) -> Population:
+        """The most probable population."""
+        return self.target.population(self.mode)
+
+    def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
+        """NumPyro's NUTS for the model, from the mode on, in coordinates in which the covariance there is the identity.
+
+        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
+        every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
+        they mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`.
+
+        Args:
+            explicit: sample every particle's own numbers.
+            settings: of `numpyro.infer.NUTS`.
+        """
+        from numpyro.infer import NUTS, init_to_value
+
+        coordinates = FitCoordinates(self, explicit=explicit)
+        start = init_to_value(values={"coordinates": jnp.zeros(coordinates.size)})
+        model = partial(FitCoordinates.numpyro_model, coordinates)
+        return NUTS(model, **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
 
 
 def exact_likelihood(fit: Fit) -> ExactLikelihood:
@@ -232,6 +311,13 @@ def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1
         "ess_tail": tail,
         "leapfrogs": run.leapfrogs,
     }
+
+
+def effect_numbers(population: Population, model: Model) -> dict[str, np.ndarray]:
+    """Parameters of the effects by the names of their sites, with the leading axes of the population."""
+    theta, spread = np.asarray(population.theta), np.asarray(population.theta_scatter)
+    named = {name: theta[..., k] for k, name in enumerate(model.forms.names)}
+    return named | {f"tau_{name}": spread[..., j] for j, name in enumerate(model.varying_places)}
 
 
 def coordinates_of(population: Population, model: Model) -> dict[str, np.ndarray]:

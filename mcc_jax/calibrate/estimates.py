@@ -18,7 +18,7 @@ from ..effects import AbstractEffect, Variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 from .judgement import modulus_is_open
 from .model import Model
-from .population import COEFFICIENTS, Population
+from .population import COEFFICIENTS
 
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
 """Diagnostics of methods that draw nothing."""
@@ -92,13 +92,6 @@ def force_zero(curve: Curve) -> dict[str, Any]:
     if checked is None or not (checked.force_zero_mN or checked.force_zero_sd_mN):
         return estimate(None)
     return normal_estimate(checked.force_zero_mN, checked.force_zero_sd_mN)
-
-
-def effect_numbers(population: Population, model: Model) -> dict[str, np.ndarray]:
-    """Parameters of the effects by the names of their sites, with the leading axes of the population."""
-    theta, spread = np.asarray(population.theta), np.asarray(population.theta_scatter)
-    named = {name: theta[..., k] for k, name in enumerate(model.forms.names)}
-    return named | {f"tau_{name}": spread[..., j] for j, name in enumerate(model.varying_places)}
 
 
 def effect_entries(model: Model, estimates: Mapping[str, Any]) -> list[dict[str, Any]]:

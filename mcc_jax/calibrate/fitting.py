@@ -16,10 +16,11 @@ from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled, make_room
 from .data import MOST_POINTS, Selection, Tests, point_noise_um, select
+from .draws import Fit
 from .forward import Linear, Point, linearise
 from .linearisation import Linearisation
 from .marginal import Summaries, summarise
-from .mode import Fit, LogPosterior, careful_enough, expect, log_densities, most_probable
+from .mode import LogPosterior, careful_enough, expect, log_densities, most_probable
 from .model import Model
 from .noise import (
     Noise,

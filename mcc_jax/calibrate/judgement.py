@@ -18,7 +18,7 @@ from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.findings import named
 from ..campaign.plausibility import add_likely_unit_error
-from .mode import Fit
+from .draws import Fit
 
 MODULUS_OPEN = "unknown modulus"  # the `check` of the finding that the tests leave the modulus open
 UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"

@@ -18,12 +18,12 @@ from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .compiling import one_blas_thread
 from .data import Selection, Tests
+from .draws import Fit
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
 from .fitting import beyond_numbers, checked_settings, prepare
 from .forward import residuals
 from .hierarchical import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
 from .judgement import numbers_in_reach
-from .mode import Fit
 from .model import Model
 from .population import COEFFICIENTS
 from .priors import SpreadCoordinate, nuisance_moments

@@ -1,10 +1,10 @@
 """The population in coordinates without bounds, given the tests with every particle integrated out: its density, its
-mode, the particles that it expects; and the fit at that mode, from which samplers start."""
+mode, and the particles that it expects."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -13,19 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.handlers
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 
-from .._format import table, with_sd
 from .._types import Scalar
-from ..arguments import is_traced
 from .compiling import compiled, side_by_side
-from .data import Tests
-from .forward import Point
 from .marginal import Marginal, straighten
 from .model import Model
-from .noise import NoiseFit, Whitening, standard_promotion
-from .particle_fit import ParticleFits
+from .noise import standard_promotion
 from .population import Population
 from .sharding import padded
 
@@ -38,9 +33,6 @@ DENSITIES, DENSITIES_AT_ONCE = 250, 10  # coordinates in one call, and side by s
 DIFFERENCE = 0.02  # step of differences, in sd: rounding and the series' next term are below 1e-4 of the curvature
 MODE_GAIN = 1e-6  # twice the log probability still to gain, by Newton's method, at which the mode is reached
 ATTEMPTS = 4  # how often the search for the mode begins again where it stopped
-# Acceptance that NUTS aims at. Where spreads are small the density of the population parameters is narrow (a funnel),
-# and with fewer than some ten particles the usual 0.8 lets trajectories diverge there.
-ACCEPT = 0.99
 
 
 def seeded(model: Any) -> Any:
@@ -276,80 +268,3 @@ def _newton(origin: np.ndarray, unit: np.ndarray, width: np.ndarray, target: Log
         method="trust-exact",
         options={"gtol": 1e-4, "maxiter": 200},
     )
-
-
-# ---- the fit at the mode ---------------------------------------------------------------------------------------------
-
-
-class Fit(eqx.Module):
-    """Particles, noise and population of a campaign in agreement.
-
-    Attributes:
-        model: what was assumed.
-        tests: the measurements.
-        individual: every particle on its own.
-        noise: the campaign's noise.
-        filters: its filters at the point.
-        point: most probable numbers of every particle.
-        residual: measured less predicted displacement there [um], 0 where masked.
-        marginal: the tests there, with every particle's own numbers integrated out.
-        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
-        converged: for particles, noise and population in turn.
-    """
-
-    model: Model = eqx.field(static=True)
-    tests: Tests
-    individual: ParticleFits
-    noise: NoiseFit
-    filters: Whitening
-    point: Point
-    residual: Float[Array, "particles points"]
-    marginal: Marginal
-    mode: Float[Array, " d"]
-    covariance: Float[Array, "d d"]
-    converged: Bool[np.ndarray, " 3"]
-
-    def __repr__(self) -> str:
-        if is_traced(self.mode):
-            return "Fit while JAX traces it"
-        sd = np.sqrt(np.diag(np.asarray(self.covariance)))
-        numbers = zip(self.names, np.asarray(self.mode), sd, strict=True)
-        rows = [(name, with_sd({"value": float(value), "sd": float(s)})) for name, value, s in numbers]
-        state = "converged" if self.converged.all() else "NOT converged"
-        effects = ", ".join(variant.label for variant in self.model.effects) or "no effects"
-        return table(f"Fit of {len(self.tests)} particles, {effects}, {state}; in unbounded coordinates", rows)
-
-    @property
-    def target(self) -> LogPosterior:
-        """The density of the population given all tests, in unbounded coordinates."""
-        return LogPosterior.of(self.model, self.marginal)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
-        return coordinate_names(self.model)
-
-    @property
-    def population(self) -> Population:
-        """The most probable population."""
-        return self.target.population(self.mode)
-
-    def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
-        """NumPyro's NUTS for the model, from the mode on, in coordinates in which the covariance there is the identity.
-
-        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
-        every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
-        they mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`.
-
-        Args:
-            explicit: sample every particle's own numbers.
-            settings: of `numpyro.infer.NUTS`.
-        """
-        from numpyro.infer import NUTS, init_to_value
-
-        from .draws import FitCoordinates
-
-        coordinates = FitCoordinates(self, explicit=explicit)
-        start = init_to_value(values={"coordinates": jnp.zeros(coordinates.size)})
-        model = partial(FitCoordinates.numpyro_model, coordinates)
-        return NUTS(model, **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)

@@ -16,17 +16,16 @@ from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, che
 from ..campaign.findings import worst
 from .compiling import imported_meanwhile, one_blas_thread
 from .data import Selection
-from .draws import draw_fast, draw_joint, named_population
-from .estimates import effect_entries, effect_numbers, finite, summary
+from .draws import Fit, draw_fast, draw_joint, effect_numbers, named_population
+from .estimates import effect_entries, finite, summary
 from .fitting import Start, checked_settings, prepare
 from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
 from .judgement import at_noise_level, numbers_in_reach
-from .mode import Fit
 from .model import Model
 from .particles import Length
 from .population import COEFFICIENTS, Population
 from .predict import data_tree, predict_measured
-from .results import JointCalibration
+from .results import PosteriorDraws
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -35,7 +34,7 @@ Mode = Literal["fast", "joint"]
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class Posterior(JointCalibration):
+class Posterior(PosteriorDraws):
     """The posterior of a campaign.
 
     Draws have the axes (chain, draw, ...); where importance weights were needed they have been applied, in order within

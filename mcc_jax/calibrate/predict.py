@@ -26,11 +26,10 @@ from .model import Model
 from .noise import Whitening, forward_substitution
 from .population import COEFFICIENTS, Population, flattened
 from .priors import population_sites
+from .results import PosteriorDraws
 
 if TYPE_CHECKING:
     from xarray import DataTree
-
-    from .posterior import Posterior
 
 VARIABLES: dict[str, tuple[str, list[str]]] = {
     "effective_modulus_MPa": ("MPa", []),
@@ -121,7 +120,7 @@ def laws_with(model: Model, C: np.ndarray, a: np.ndarray, modulus: np.ndarray, t
     return eqx.filter_vmap(one)(*(jnp.asarray(x) for x in (C, a, modulus, theta)))
 
 
-def sample_laws(calibration: Posterior, count: int, *, seed: int = 0) -> MccLaw:
+def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> MccLaw:
     """Laws of `count` particles never measured: one posterior draw of the population each.
 
     They carry both the scatter of the particles and the uncertainty of the population, in one law whose array fields
@@ -142,7 +141,7 @@ def sample_laws(calibration: Posterior, count: int, *, seed: int = 0) -> MccLaw:
 
 
 def predict_new_particle(
-    calibration: Posterior,
+    calibration: PosteriorDraws,
     diameters_um: Any,
     force_mN: Any,
     time_s: Any = None,
@@ -174,7 +173,7 @@ def predict_new_particle(
     return PredictedCurves(force, np.asarray(paths), None, laws)
 
 
-def predict_measured(calibration: Posterior, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
+def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
     """Draws of a measured particle's curve at its measured forces, its zero included, without and with noise.
 
     Raises:
@@ -191,7 +190,7 @@ def predict_measured(calibration: Posterior, particle: str, *, count: int = 200,
     return predicted_at(calibration, row, pick, seed)
 
 
-def predicted_at(calibration: Posterior, row: int, pick: np.ndarray, seed: int) -> PredictedCurves:
+def predicted_at(calibration: PosteriorDraws, row: int, pick: np.ndarray, seed: int) -> PredictedCurves:
     """As `predict_measured`, of the row-th particle at chosen draws of all chains in a row."""
     c, length = calibration, len(calibration.selection.rows[row])
     of_particle = (x[:, :, row] for x in (c.C, c.modulus_MPa, c.theta, c.zero_um))
@@ -206,7 +205,7 @@ def predicted_at(calibration: Posterior, row: int, pick: np.ndarray, seed: int) 
     return PredictedCurves(np.asarray(test.force)[:length], clean[:, :length], observed[:, :length], laws)
 
 
-def compare_with_paper(calibration: Posterior) -> list[dict[str, Any]]:
+def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
     """The paper's Table 2, a and modulus next to ours: one row per quantity, with mean, sd and interval of ours."""
     named = calibration.named_population()
     paper: dict[str, float | None] = {"a": PAPER_SHAPE_PARAMETER}
@@ -220,7 +219,7 @@ def compare_with_paper(calibration: Posterior) -> list[dict[str, Any]]:
 # ---- ArviZ -----------------------------------------------------------------------------------------------------------
 
 
-def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
+def prior_draws(calibration: PosteriorDraws, count: int, seed: int) -> dict[str, np.ndarray]:
     """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
     flatness = np.asarray(calibration.fit.tests.flatness)
     rng = np.random.default_rng(seed)
@@ -236,7 +235,7 @@ def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
     return {"mu": mu, "tau": np.asarray(p.tau)} | medians | named
 
 
-def data_tree(c: Posterior, prior_count: int, points: bool, seed: int) -> DataTree:
+def data_tree(c: Any, prior_count: int, points: bool, seed: int) -> DataTree:
     """What `Posterior.to_arviz` gives."""
     from arviz_base import from_dict
 
@@ -323,7 +322,7 @@ def data_tree(c: Posterior, prior_count: int, points: bool, seed: int) -> DataTr
 
 
 def _predictive(
-    c: Posterior, prior: dict[str, np.ndarray], seed: int, *, everything: bool
+    c: PosteriorDraws, prior: dict[str, np.ndarray], seed: int, *, everything: bool
 ) -> tuple[int, np.ndarray, np.ndarray]:
     """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked.
 
@@ -347,7 +346,7 @@ def _predictive(
     return shown, predicted, before
 
 
-def _point_likelihoods(c: Posterior) -> np.ndarray:
+def _point_likelihoods(c: PosteriorDraws) -> np.ndarray:
     """Log density of every reading given those before it and its particle's own numbers, shape (chain, draw, N, n)."""
     a, log_noise = (flattened(np.asarray(x)) for x in (c.population.a, c.population.log_noise))
     found = []
@@ -374,7 +373,7 @@ def _one_ahead(laws: MccLaw, zero: Array, factor: Array, test: Tests, noise: Whi
     return jax.lax.map(one, (laws, zero, factor))
 
 
-def _prior_curves(c: Posterior, prior: dict[str, np.ndarray], row: int, count: int, seed: int) -> np.ndarray:
+def _prior_curves(c: PosteriorDraws, prior: dict[str, np.ndarray], row: int, count: int, seed: int) -> np.ndarray:
     """Curves of the row-th particle from the prior, around its recorded contact."""
     rng = np.random.default_rng([seed, row])
     pick = rng.integers(prior["a"].shape[1], size=count)

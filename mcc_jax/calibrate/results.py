@@ -21,11 +21,11 @@ from ..effects import Variant
 from ..law import MccLaw
 from .curves import FittedCurve, fitted_curves
 from .data import Selection, compared_rows, ranges_um, root_mean_squares
+from .draws import Fit
 from .estimates import estimate, finite, force_zero, law_of, log_estimate, quantities
 from .judgement import judged, misfit_note, noise_note, noise_share, unlike_others
-from .mode import Fit
 from .model import Model
-from .population import COEFFICIENTS
+from .population import COEFFICIENTS, Population
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -213,6 +213,22 @@ class JointCalibration(Calibration):
             }
             for i, name in enumerate(self.campaign.particles)
         ]
+
+
+class PosteriorDraws(JointCalibration):
+    """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
+
+    mode: str
+    seed: int
+    population: Population
+    C: np.ndarray
+    modulus_MPa: np.ndarray
+    zero_um: np.ndarray
+    shape_factor: np.ndarray
+    theta: np.ndarray
+    log_likelihood: np.ndarray
+    pareto_k: np.ndarray
+    divergences: int
 
 
 def load(folder: str | Path) -> Any:
