@@ -139,14 +139,14 @@ def _name_column(table: Table, allowed: Sequence[str] = ("particle",)) -> int:
 
 def _measured(table: Table, quantities: Mapping[str, str]) -> dict[int, np.ndarray]:
     """The columns of some quantities in mN, um or s, by their place in the table."""
-    found = dict(find_column(table.header, name, dimension, table.file) for name, dimension in quantities.items())
-    if quantities is _DIAMETERS or table.delimiter != ",":
-        table.refuse_groups(list(found))
-    for column, raw in zip(found, table.numbers(list(found)), strict=True):
-        values = convert(raw, found[column])
-        check_magnitudes(values, table.file, table.rows, table.header[column], diameter=quantities is _DIAMETERS)
-        found[column] = values
-    return found
+    factors = dict(find_column(table.header, name, dimension, table.file) for name, dimension in quantities.items())
+    columns, sizes = list(factors), quantities is _DIAMETERS
+    if sizes or table.delimiter != ",":
+        table.refuse_groups(columns)
+    values = [convert(raw, factors[i]) for i, raw in zip(columns, table.numbers(columns), strict=True)]
+    for i, each in zip(columns, values, strict=True):
+        check_magnitudes(each, table.file, table.rows, table.header[i], diameter=sizes)
+    return dict(zip(columns, values, strict=True))
 
 
 def _read_curves(file: Path, particles: Sequence[str], sizes: Table) -> tuple[Curve, ...]:
@@ -168,7 +168,8 @@ def _read_curves(file: Path, particles: Sequence[str], sizes: Table) -> tuple[Cu
         if name not in particles:
             remedy = _similar(name, particles) or f"Add its diameters to {PARTICLES} or remove its rows here"
             raise table.wrong(f"the particle {name!r} is not in {PARTICLES}", records[0], where, remedy)
-    curves = tuple(Curve(*(values[rows[name]] for values in channels.values())) for name in particles)
+    time, force, displacement = channels.values()
+    curves = tuple(Curve(time[at], force[at], displacement[at]) for at in (rows[name] for name in particles))
     for name, curve in zip(particles, curves, strict=True):
         if (fault := fault_of(name, curve)) is not None:
             column = dict(zip(_CHANNELS, channels, strict=True)).get(fault.channel, where)

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -349,7 +350,7 @@ def plain_table(text: str, file: Path, names: str) -> Table | None:
     if '"' in text or names not in cells or filled(cells) < len(cells):
         return None
     header = _header(cells, file)
-    types = {name: object if name == names else float for name in header}
+    types: Any = {name: object if name == names else float for name in header}
     try:  # without the filter of missing values, cells that are empty or too few are errors
         frame = pd.read_csv(io.BytesIO(text.encode()), header=0, names=header, dtype=types, na_filter=False)
     except ValueError:

@@ -104,12 +104,8 @@ def test_a_file_that_cannot_be_read_is_named_with_the_way_to_leave_it_out(tmp_pa
         assert findings(campaign) == ["2 files skipped as asked: notes.txt, P 2.txt"]
     assert "--leave-out Notes fits no file" in told(folder, skip=["Notes"])
     assert "there is no instrument file" in told(folder, skip=["*"])
-    assert "All 2 files fail in the same way" in told(_all_bad(tmp_path))
-
-
-def _all_bad(tmp_path):
     (tmp_path / "bad").mkdir()
-    return folder_of(tmp_path / "bad", {"a.txt": "x", "b.txt": "y"})
+    assert "All 2 files fail in the same way" in told(folder_of(tmp_path / "bad", {"a.txt": "x", "b.txt": "y"}))
 
 
 def test_names_that_no_file_can_hold(tmp_path):
@@ -177,17 +173,13 @@ def test_diameters_of_the_files_and_of_a_table(tmp_path):
 
 def test_folders_that_are_none_of_instruments(tmp_path):
     folder = folder_of(tmp_path, TESTS)
-    assert "one of the folders in it: Série 7" in told(_nested(tmp_path))
+    (tmp_path / "nest" / "Série 7").mkdir(parents=True)
+    assert "one of the folders in it: Série 7" in told(tmp_path / "nest")
     write_campaign(read(folder), tmp_path / "out")
     assert "is a campaign already" in told(tmp_path / "out")
     assert "test_name" in told(folder, 'test_name = "A"\n')
     with pytest.raises(InputError, match="nothing to skip"):
         read_instrument_file(folder / "P9.txt", mapping=tmp_path / "m.toml", diameters_um=SIZES, skip=["x"])
-
-
-def _nested(tmp_path):
-    (tmp_path / "nest" / "Série 7").mkdir(parents=True)
-    return tmp_path / "nest"
 
 
 @settings(max_examples=100, deadline=None)

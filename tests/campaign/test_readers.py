@@ -84,13 +84,6 @@ def test_micromaterials():
     assert len({len(curve) for curve in campaign.curves}) > 10
 
 
-def test_single_micromaterials_text(tmp_path):
-    with zipfile.ZipFile(INSTRUMENTS / "multipleIndentations.zip") as archive:
-        name = archive.namelist()[0]
-        (tmp_path / "one.dat").write_bytes(archive.read(name))
-    assert read(tmp_path / "one.dat").particles == ("one",)
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_format_is_told_by_content_and_campaign_survives_files(tmp_path, name):
     disguised = tmp_path / "data.bin"

@@ -73,11 +73,6 @@ def test_trailing_delimiters_on_some_rows_and_without_header(tmp_path):
     assert_read(convert(tmp_path, "\n".join(line + "," for line in lines[1:]), "header_rows = 0", numbered))
 
 
-def test_what_holds_something_is_no_trailing_delimiter(tmp_path):
-    assert "4 cells where 3" in told(tmp_path, table(end=",x"))
-    assert "row 3: 4 cells where 3" in told(tmp_path, table().replace("0.5", "0,5"))
-
-
 PARTICLES = "particle,D1_um,D2_um,D3_um\nA,200,190,180\nB,150,140,130\n"
 CURVES = "particle,time_s,force_mN,displacement_um\n" + "".join(
     f"{name},{t},{f},{d}\n" for name in "AB" for t, f, d in ROWS
@@ -154,11 +149,6 @@ def test_names_in_two_unicode_forms_are_one(tmp_path):
     lines = CURVES.replace("A", APART).splitlines()
     mixed = "\n".join([*lines[:3], *(line.replace(APART, COMPOSED) for line in lines[3:])])
     assert_read(campaign_of(tmp_path, PARTICLES.replace("A", COMPOSED), mixed), 2)
-
-
-def test_names_in_two_unicode_forms_stay_two_if_both_tables_have_both(tmp_path):
-    both = [text.replace("A", COMPOSED).replace("B", APART) for text in (PARTICLES, CURVES)]
-    assert campaign_of(tmp_path, *both).particles == (COMPOSED, APART)
 
 
 def test_columns_tests_and_diameters_in_two_unicode_forms(tmp_path):
@@ -282,17 +272,16 @@ def test_missing_readings(tmp_path, mark, column):
         assert f'missing = ["{mark}"]' in text
 
 
+def test_every_reading_missing(tmp_path):
+    text = table(rows=[("1", "-", "2"), ("2", "-", "3")])
+    assert "every row has a missing reading" in told(tmp_path, text, 'missing = ["-"]')
+
+
 def test_the_number_nan_of_a_mapping_and_comments_of_delimiters(tmp_path):
     text = "; a remark\n" + table(rows=[*ROWS, ("4", "nan", "1")], mark=";").replace("t,F,d", "t;F;d")
     assert_read(convert(tmp_path, text, 'delimiter = ";"\ncomment_prefix = ";"\nskip_rows = 1\nmissing = [nan]'))
     body = text.partition("\n")[2].replace("2;5", "; two\n2;5")
     assert_read(convert(tmp_path, body, 'delimiter = ";"\ncomment_prefix = ";"\nmissing = [nan]'))
-
-
-def test_every_reading_missing(tmp_path):
-    assert "every row has a missing reading" in told(
-        tmp_path, table(rows=[("1", "-", "2"), ("2", "-", "3")]), 'missing = ["-"]'
-    )
 
 
 # ---- above and below the samples -------------------------------------------------------------------------------------

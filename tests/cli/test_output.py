@@ -85,19 +85,6 @@ def test_a_folder_where_a_file_belongs_and_a_file_where_a_folder(tmp_path):
     assert snapshot(tmp_path) == before
 
 
-def test_a_folder_within_a_stage_appears_with_it(tmp_path):
-    with results(tmp_path) as stage:
-        with results(stage.folder / "inner") as inner:
-            (inner.folder / "one.txt").write_text("1")
-        assert not (tmp_path / "inner").exists()
-    assert snapshot(tmp_path) == {"inner": None, "inner/one.txt": b"1"}
-
-
-def failing(error, folder):
-    with results(folder) as stage:
-        raise error(stage)
-
-
 def test_the_users_folder_is_named_not_the_stage(tmp_path):
     def error(stage):
         return InputError("cannot be written", file=stage.folder / "campaign", remedy="Make room")

@@ -164,7 +164,9 @@ def _or_skip(error: InputError, files: Sequence[Path], others: str = "") -> Inpu
 
 def _control(found: dict[Path, Tests]) -> Control | None:
     """The controlled quantity, if it is the same for all; where one file does not say, it is not known."""
-    by = {tests.control: file for file, tests in reversed(found.items())}  # the first of each
+    by: dict[Control | None, Path] = {
+        tests.control: file for file, tests in reversed(found.items())
+    }  # the first of each
     if "load" in by and "displacement" in by:
         problem = f"the test is controlled by displacement, that of {by['load'].name} by load"
         remedy = "Convert tests of two kinds separately, with --leave-out"
