@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,6 @@ from ..campaign import load_toml_file
 from ..effects import Nuisance, Variant
 from ..law import Unloading
 from .population import COEFFICIENTS, Population
-
-if TYPE_CHECKING:
-    from .model import Model
 
 ALMOST = 0.98  # share of the way to the value of a at which a particle's shape factor would vanish
 # Peak stress [MPa] and scaled strain there of the paper's tests, about: what the default priors belong to.
@@ -387,9 +384,9 @@ class Sites(NamedTuple):
 
 
 def population_sites(
-    model: Model, flatness: np.ndarray, known: Population | None, rng: np.random.Generator | None = None, count: int = 1
+    model: Any, flatness: np.ndarray, known: Population | None, rng: np.random.Generator | None = None, count: int = 1
 ) -> Sites:
-    """The sites at known populations, every field with a leading axis, or else at draws from the prior.
+    """The sites of a `Model` at known populations, every field with a leading axis, or else at draws from the prior.
 
     Of the coordinates of a known spread it is the positive one.
     """
