@@ -85,6 +85,11 @@ def test_a_folder_where_a_file_belongs_and_a_file_where_a_folder(tmp_path):
     assert snapshot(tmp_path) == before
 
 
+def failing(error, folder):
+    with results(folder) as stage:
+        raise error(stage)
+
+
 def test_the_users_folder_is_named_not_the_stage(tmp_path):
     def error(stage):
         return InputError("cannot be written", file=stage.folder / "campaign", remedy="Make room")
