@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from .._format import plain, with_sd
+from .._format import first_few, plain, with_sd
 from ..campaign import Curve
 from ..effects import AbstractEffect, Variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
@@ -240,8 +240,7 @@ def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
     """
     entries = {str(entry["particle"]): entry for entry in content["particles"]}
     if particle not in entries:
-        shown = ", ".join(list(entries)[:12]) + (", ..." if len(entries) > 12 else "")
-        raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {shown}.")
+        raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {first_few(entries, 12)}.")
     if not entries[particle]["kept"]:
         raise InputError(
             f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}",

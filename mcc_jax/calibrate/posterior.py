@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from .. import arguments
+from .._format import first_few
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..campaign.findings import worst
@@ -124,7 +125,7 @@ class Posterior(PosteriorDraws):
             found.append(f"{self.divergences} trajectories diverged: draw longer, or narrow the priors")
         bad = np.flatnonzero(~(self.pareto_k <= MOST_PARETO_K))
         if len(bad):
-            names = ", ".join(self.particles[i] for i in bad[:5]) + (", ..." if len(bad) > 5 else "")
+            names = first_few((self.particles[i] for i in bad), 5)
             found.append(
                 f"Pareto k is above {MOST_PARETO_K} for particle {names}: its likelihood is far from the quadratic "
                 "that the fast mode takes it for; use --mode joint, or leave the particle out"
