@@ -199,6 +199,7 @@ class LeastSquares(JointCalibration):
                 "loss": finite(float(self.solution.loss)),
                 "chi2_per_dof": finite(self._chi2()),
                 "noise_share": finite(self.noise_share),
+                "own_misfit": finite(self.own_misfit),
                 "singular_values": [float(v) for v in self.identifiability.singular_values],
                 "open_combinations": self.identifiability.open,
                 "agreeing_starts": list(self.agreeing_starts),

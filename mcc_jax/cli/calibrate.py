@@ -139,7 +139,7 @@ def calibrate(
             right = " or ".join(option.methods)
             raise click.UsageError(f"{option.opts[0]} belongs to --method {right}, not to {method}.")
     without = {*NO_SETTINGS, *(option.name for option in other)}
-    with session(12) as progress:
+    with session() as progress:
         data = read_without(campaign, options["leave_out"], progress)
         if options["reference"] is not None:
             require_particle(options["reference"], data, "--reference")

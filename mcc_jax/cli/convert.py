@@ -65,7 +65,7 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: tuple[Path, .
       [diameters]                   # if a row above the samples gives the diameter
       header = "Gage length"
     """
-    with session(3) as progress:
+    with session() as progress:
         from .._format import span
         from ..campaign import (
             campaign_findings,

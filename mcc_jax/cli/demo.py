@@ -57,7 +57,7 @@ def demo(out: Path, seed: int) -> None:
     Example:
       mcc-jax demo --out try --seed 1
     """
-    with session(68) as progress, results(out) as stage:
+    with session() as progress, results(out) as stage:
         effect, sealed = sealed_answer(seed)
         say("Something that the law does not contain is hidden in simulated tests. The answer is sealed, SHA-256:")
         say(f"  {seal_of(sealed)}", bold=True)

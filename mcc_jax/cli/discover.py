@@ -82,7 +82,7 @@ def discover(
       mcc-jax discover my-tests --out found
       mcc-jax discover my-tests --out found --exclude thermal_drift --unloading punch
     """
-    with session(20) as progress:
+    with session() as progress:
         from ..discovery import discover as find
 
         require_mechanisms(options["exclude"])
@@ -188,7 +188,7 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
       mcc-jax simulate --particles twelve.csv --out planned --levels 0.5,1,1 --hold-s 20 --noise-um 0.05 --noise-mN 0.05
       mcc-jax power planned --out planned
     """
-    with session(20) as progress:
+    with session() as progress:
         from ..discovery import power_of_campaign
         from ..effects import LIBRARY
 

@@ -59,20 +59,7 @@ class Location(click.Path):
         return super().convert(value, param, ctx)
 
 
-class CampaignFolder(Location):
-    """A campaign; a path that cannot be one is refused before anything else is asked for."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path of a text. Raises `InputError` saying what was expected and what is there."""
-        path = super().convert(value, param, ctx)
-        if not all((path / name).exists() for name in ("particles.csv", "curves.csv")):
-            from ..campaign import check_folder
-
-            check_folder(path)
-        return path
-
-
-campaign = click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
+campaign = click.argument("campaign", type=Location(), metavar="CAMPAIGN")
 
 
 def out(**settings: Any) -> Any:

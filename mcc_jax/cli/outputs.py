@@ -33,7 +33,7 @@ def report(folder: Path, out: Path | None, campaign: Path | None) -> None:
       mcc-jax report mcc-jax-demo
       mcc-jax report my-fit --campaign my-tests --out for-my-colleague
     """
-    with session(4) as progress:
+    with session() as progress:
         from ..report import read_results, report_page
 
         progress("reading the results")
@@ -89,7 +89,7 @@ def export(
       mcc-jax export fit --format c --out law
       mcc-jax export fit --format json --out law --particle 7 --diameters tests/particles.csv
     """
-    with session(3) as progress:
+    with session() as progress:
         from ..export import read_calibration, write_export
 
         progress("reading the calibration")

@@ -34,12 +34,12 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy
 
 
 @contextlib.contextmanager
-def session(steps: int) -> Iterator[Progress]:
-    """Double precision, and progress on standard error: a bar on a terminal, a line for each step elsewhere.
+def session() -> Iterator[Progress]:
+    """Double precision, and progress on standard error: the present step on a terminal, a line for each elsewhere.
 
-    Yields a function to be called with the name of each step as it begins, `steps` times in all.
+    Yields a function to be called with the name of each step as it begins.
     """
-    with _progress(steps) as progress:
+    with _progress() as progress:
         progress("loading the library")
         for noisy in ("jax", "matplotlib"):  # hints about accelerators and caches are not for a pipe
             logging.getLogger(noisy).setLevel(logging.ERROR)
@@ -94,7 +94,7 @@ def _private(folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _progress(steps: int) -> Iterator[Progress]:
+def _progress() -> Iterator[Progress]:
     if sys.stderr is None:
         yield lambda _: None
         return
@@ -102,14 +102,11 @@ def _progress(steps: int) -> Iterator[Progress]:
         with _logged(sys.stderr) as progress:
             yield progress
         return
-    from rich import progress as rich
     from rich.console import Console
+    from rich.text import Text
 
-    text = rich.TextColumn("{task.description}", markup=False)
-    columns = (rich.SpinnerColumn(), text, rich.BarColumn(24), rich.TimeElapsedColumn())
-    with rich.Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
-        task = bar.add_task("", total=steps + 1, completed=-1)
-        yield lambda step: bar.update(task, description=step, advance=1)
+    with Console(stderr=True).status("") as status:
+        yield lambda step: status.update(Text(step))  # a text has no markup
 
 
 QUIET_S = 2.0

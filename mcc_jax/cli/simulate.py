@@ -111,7 +111,7 @@ def simulate(out: Path, **options: Any) -> None:
       rate = 4.0
     """
     _refuse_contradictions(options)
-    with session(3) as progress:
+    with session() as progress:
         from ..campaign import write_campaign
 
         progress("reading the input")

@@ -50,7 +50,7 @@ class Check:
 
 
 def check_results(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Check]:
-    """All checks that these results allow; `shown` are their predictions, for what the calibration does not say."""
+    """All checks that these results allow; `shown` are their predictions."""
     findings, content = tested(results), results.calibration
     found = [
         Check(OF_FINDINGS[one.level][0], f"Tests: {one.check}", OF_FINDINGS[one.level][1], "nothing found", str(one))
@@ -60,7 +60,7 @@ def check_results(results: Results, shown: Sequence[FittedCurve] = ()) -> list[C
         found += _calibration(content)
         if content["method"] == "bayes":
             found += _sampler(content["diagnostics"])
-        found += _fit(content, shown)
+        found += _fit(content)
     inside = share_inside(shown)
     if inside is not None:
         text = (
@@ -154,14 +154,12 @@ def _sampler(d: dict[str, Any]) -> list[Check]:
     ]
 
 
-def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Check]:
+def _fit(content: dict[str, Any]) -> list[Check]:
     d = content["diagnostics"]
     misfit, noise = d.get("own_misfit"), d.get("noise_share")
     falling = (content.get("probability_not_monotone") or {}).get("value")
-    if misfit is None and shown:
-        misfit = _own_misfit(shown)
     found = []
-    if misfit is not None and math.isfinite(misfit):
+    if misfit is not None:
         text = (
             "Median misfit with each particle's own coefficients, as a share of its range of displacement. If large: "
             "these may be no compressions of single particles, or the diameters are wrong."
@@ -182,12 +180,6 @@ def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Check]:
     name = "Data determine the parameters"
     gaps = d.get("open_combinations", [])
     return found + [Check("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
-
-
-def _own_misfit(shown: Sequence[FittedCurve]) -> float:
-    """Median over the particles of the root mean square misfit, in shares of the range of displacement."""
-    own = [(one.rms_um, float(np.ptp(one.displacement_um[one.used]))) for one in shown if one.rms_um is not None]
-    return float(np.median([rms / reach for rms, reach in own if rms is not None and reach > 0] or [np.nan]))
 
 
 def _data(results: Results) -> Check:

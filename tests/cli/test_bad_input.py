@@ -107,7 +107,6 @@ COMMAND_LINES = {
     "calibrate {c} {c} --out {o}": "unexpected extra argument",
     "calibrate {c} --out {o} --no-figure": "--no-figures",
     "calibrat {c} --out {o}": "'calibrate'",
-    "discover {n}": "no such folder",
     "discover {c} --out {o} --exclude wobble": "--exclude takes one of: frame_compliance, thermal_drift",
     "discover {c} --out {o} --held-out": "--no-held-out",
     "rapport {c} --out {o}": "No such command 'rapport'",

@@ -187,7 +187,7 @@ def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
 
 
 @posix
-def test_progress_on_a_terminal_is_a_bar_on_standard_error(tmp_path):
+def test_progress_on_a_terminal_is_on_standard_error(tmp_path):
     import pty  # not there on Windows, where this test is skipped
 
     ours, theirs = pty.openpty()

@@ -377,15 +377,6 @@ def test_checks_change_where_the_gates_are(results, check, changes, level):
     assert found[check].level == level
 
 
-def test_misfit_is_measured_where_the_calibration_does_not_report_it(results, shown):
-    diagnostics = {**results.calibration["diagnostics"], "own_misfit": None}
-    silent = dataclasses.replace(results, calibration={**results.calibration, "diagnostics": diagnostics})
-    bad = [dataclasses.replace(one, displacement_um=1.1 * one.displacement_um) for one in shown]
-    for tests, level in ((shown, "good"), (bad, "bad")):
-        assert {one.check: one.level for one in check_results(silent, tests)}["The law's form fits"] == level
-    assert "The law's form fits" not in {one.check for one in check_results(silent)}
-
-
 def test_a_calibration_that_did_not_converge_is_no_green_page(folder):
     found = changed(folder, converged=False)
     assert check_results(found)[0].level == "bad"
