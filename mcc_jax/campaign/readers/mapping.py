@@ -192,29 +192,27 @@ class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
     diameters: InHeader | None = None
 
     def __post_init__(self) -> None:
-        if not _is_encoding(self.encoding):
-            raise _wrong(f"{self.encoding!r} is no encoding", "encoding")
-        if self.thousands not in (None, *_THOUSANDS):
-            raise _wrong(f"{self.thousands!r} is not allowed", "thousands")
+        sizes, many = self.diameters, 'If a column names the test, write tests = "column" and [columns.test]'
+        header, keep = "Write header_rows of at least 1", "Keep one of them"
+        for wrong, key, problem, remedy in (
+            (not _is_encoding(self.encoding), "encoding", f"{self.encoding!r} is no encoding", ""),
+            (self.thousands not in (None, *_THOUSANDS), "thousands", f"{self.thousands!r} is not allowed", ""),
+            (self.begin and self.skip_rows is not None, "begin", "is given in addition to 'skip_rows'", keep),
+            (self.begin and not self.header_rows, "begin", "needs a header", header),
+            (self.tests == "header" and not self.header_rows, "tests", "needs a header", header),
+            (self.test_name and self.tests != "file", "test_name", 'is for tests = "file" only', "Remove it"),
+            (self.columns.test and self.tests != "column", "columns.test", 'is for tests = "column" only', many),
+            (not self.columns.test and self.tests == "column", "columns.test", "is needed", many),
+            (sizes and self.diameters_um is not None, "diameters", "is given in addition to 'diameters_um'", keep),
+            (sizes and len(sizes.names) == 2, "diameters.header", "must name one row, or three", ""),
+        ):
+            if wrong:
+                raise _wrong(problem, key, remedy)
         self.delimiter = DELIMITERS.get(self.delimiter, self.delimiter)
         self.thousands = None if self.thousands is None else _THOUSANDS[self.thousands]
         for name, mark in (("decimal mark", self.decimal_mark), ("delimiter", self.delimiter)):
             if self.thousands and mark in self.thousands and (name == "decimal mark" or mark == " "):
                 raise _wrong(f"the mark between thousands is also the {name}", "thousands", "Correct one of them")
-        if self.begin is not None and self.skip_rows is not None:
-            raise _wrong("is given in addition to 'skip_rows'", "begin", "Keep one of them")
-        if self.header_rows == 0 and (self.begin is not None or self.tests == "header"):
-            needing = "tests" if self.begin is None else "begin"
-            raise _wrong("needs a header", needing, "Write header_rows of at least 1")
-        if self.test_name is not None and self.tests != "file":
-            raise _wrong('is for tests = "file" only', "test_name", "Remove it")
-        if (self.columns.test is None) == (self.tests == "column"):
-            remedy = 'If a column names the test, write tests = "column" and [columns.test] with column = "..."'
-            raise _wrong(f"is needed for, and only for, tests = {'"column"'}", "columns.test", remedy)
-        if self.diameters is not None and self.diameters_um is not None:
-            raise _wrong("is given in addition to 'diameters_um'", "diameters", "Keep one of them")
-        if self.diameters is not None and len(self.diameters.names) == 2:
-            raise _wrong("must name one row, or three", "diameters.header")
         for name, triple in (self.diameters_um or {}).items():
             check_triple(triple, f"{name!r}", self.file)
         _ = self.pace, self.sources, self.diameter_factor
