@@ -25,7 +25,7 @@ THRESHOLD_MPA = 0.2
 MACHINE_ZERO = (-0.25, 1.0)
 LEAST_LEVELS = 2  # a loading curve of fewer points above the threshold has no course there
 FEW_FORCES = 5  # a record with no more different forces shows steps of its read-out, not a curve of three coefficients
-# factor in stress and strain within which tests on one material end: the paper's end between 7 and 16 MPa
+# Factor in stress and strain within which tests on one material end: the paper's end between 7 and 16 MPa
 FAR_APART = 100.0
 SHOWN = 3  # particles that an error names with their reasons, at most
 
@@ -80,17 +80,12 @@ def stress_and_strain(
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
     """
-    diameter, zero = effective_diameter_um(diameters_um), _contact_um(curve, segments)
-    return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
-
-
-def _contact_um(curve: Curve, segments: tuple[Segment, ...]) -> float:
-    """The displacement at first contact [um]."""
+    diameter, path = effective_diameter_um(diameters_um), curve.displacement_um
+    first, reach = float(path[0]), float(np.ptp(path))
+    zero = 0.0 if MACHINE_ZERO[0] * reach <= first <= MACHINE_ZERO[1] * reach else first
     if contact := contact_index(segments):
-        return float(curve.displacement_um[contact])
-    first, reach = float(curve.displacement_um[0]), float(np.ptp(curve.displacement_um))
-    low, high = MACHINE_ZERO
-    return 0.0 if low * reach <= first <= high * reach else first
+        zero = float(path[contact])
+    return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (path - zero) / diameter
 
 
 def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]) -> LoadingCurve | None:

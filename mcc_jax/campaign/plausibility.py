@@ -48,10 +48,10 @@ ODDS = 3.0  # log odds from which on an error is reported: 20 to 1
 ALIKE = 1.0  # log odds within which a second hypothesis is named, too
 GROUP = 0.25  # share of the tests that have an error in common, of another instrument or another person
 SPREAD = 0.2  # least standard deviation, in decades, between particles of one campaign
-# how often D3 is the smallest, middle and largest diameter; of the paper's 20 particles 17, 3 and 0
+# How often D3 is the smallest, middle and largest diameter; of the paper's 20 particles 17, 3 and 0
 RANK_AT_REST = (0.80, 0.15, 0.05)
 BEYOND = 3.0  # factor beyond the ranges of all solids, themselves uncertain by about as much, that no solid reaches
-# factor of stress against Avicel PH-200 beyond which another material is reported; its particles scatter by 1.35
+# Factor of stress against Avicel PH-200 beyond which another material is reported; its particles scatter by 1.35
 STIFFER = 3.0
 
 

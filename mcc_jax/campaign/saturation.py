@@ -25,13 +25,13 @@ from .signal import Line, point_noise, quantile, runs
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
 COARSE = 3.0  # and this many times as many as the channel repeats elsewhere: a coarse read-out repeats every value
 STEPS = 2.0  # of its read-out that the channel itself would have gone on by, at least, at its pace before
-# share of its pace before that the other channel keeps up, unless it turns: in a hold it stands still or creeps
+# Share of its pace before that the other channel keeps up, unless it turns: in a hold it stands still or creeps
 GOES_ON = 0.5
 BEFORE = 12  # readings that give the pace: fewer do not, more reach into another part of the ramp
 ERRORS = 3.0  # standard deviations by which it must come farther; without any advance one stretch in 1000 does
 NEAR_END = 3.0  # standard deviations below the end within which only low readings are left; one in 700 lies beyond
 FITTED_FROM = 0.25  # of the end of the range: below, asperities deform, not the particle
-# share of the range by which a turn may lie beyond it: intervals of the modulus hold the truth up to there
+# Share of the range by which a turn may lie beyond it: intervals of the modulus hold the truth up to there
 TRUSTED = 0.25
 
 FORCE_RANGE = Finding(

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# samples between turns from which on third differences give the noise: at most a quarter straddle a turn
+# Samples between turns from which on third differences give the noise: at most a quarter straddle a turn
 LONG_BRANCH = 16
 DEEP_TURN = 0.1  # share of the range that noise does not reach, for a first look at how quickly a signal turns
 MANY_TURNS = 8  # more turning points make a signal one of quick cycles

@@ -16,7 +16,7 @@ from .schema import Curve
 from .segments import Segment
 from .signal import Line, median, noise_level
 
-# of the peak force within which readings on both sides give the turning point: bent ramps are parabolas there
+# Share of the peak force within which readings on both sides give the turning point: bent ramps are parabolas there
 SHARE = 0.1
 MOST = 41  # readings on each side at most; more say nothing new against the bend
 CURVED = 9  # readings from which on a parabola is drawn through them, not a straight line

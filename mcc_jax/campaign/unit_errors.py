@@ -22,14 +22,13 @@ from .signal import median
 
 CONTACT = 0.005  # share of the peak force that is contact: cellulose takes a quarter of its displacement below 3 %
 CONTACT_NOISE = 4.0  # the same in standard deviations of the force's noise, where that is more
-# times the force of contact that no reading before contact reaches; a first cycle below it is taken for approach
+# Times the force of contact that no reading before contact reaches; a first cycle below it is taken for approach
 LOADED = 4.0
-# shares of the peak force: below, plastic unloading bends (Oliver and Pharr 1992); above, it creeps
+# Shares of the peak force: below, plastic unloading bends (Oliver and Pharr 1992); above, it creeps
 UNLOADING = (0.9, 0.5)
 LEAST_RETREAT = 0.2  # share of the displacement that must be given back for the lost work to count
 CORRELATION = 0.6  # of force and displacement up to the peak, at least: loading of any material has more than 0.8
 MOST_SAMPLES = 4000  # longer records are thinned: enough for features of a curve's size
-
 
 Range = tuple[float, float]
 Values = np.ndarray | float
@@ -167,7 +166,7 @@ SOLIDS = (
     # 10 % of elongation (Ashby, strength against ductility).
     Properties((5e3, 7e5), (3e2, 7e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 2e4)),
 )
-# prior log odds of the classes: metals are rarer between platens, one in eight by assumption
+# Prior log odds of the classes: metals are rarer between platens, one in eight by assumption
 WEIGHTS = (0.0, 0.0, -2.0, -2.0)
 DIAMETER_UM = (3.0, 2e4)  # what test machines for single particles take between their platens
 FORCE_MN = (1e-3, 1e8)  # peaks, from a nanoindenter's least to a universal test machine's largest (100 kN)
