@@ -11,7 +11,7 @@ import numpy as np
 from .findings import Finding
 from .schema import Campaign, Control, Curve
 from .segments import contact_index, find_segments
-from .signal import Line, median, point_noise, two_lines
+from .signal import Line, differences, median, point_noise, two_lines
 
 AIR_READINGS = 5  # before contact, at least: fewer do not give the zero's error
 AIR_SAID = 3.0  # standard deviations from which on an offset is reported
@@ -129,7 +129,7 @@ def shared_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float]
 
 def _first_steps(curve: Curve) -> float:
     """By how much force grows from one reading to the next where a record begins [mN]."""
-    return median(np.abs(np.diff(curve.force_mN[: AIR_READINGS + 1])))
+    return median(np.abs(differences(curve.force_mN[: AIR_READINGS + 1])))
 
 
 def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None, least: float) -> ZeroOfForce | None:
@@ -153,7 +153,7 @@ def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None, least: 
 
 def _inflation(scatter: np.ndarray) -> float:
     """How much larger the error of a mean of autocorrelated readings is, by their lag-1 correlation."""
-    lag = np.clip(float(scatter[1:] @ scatter[:-1] / max(scatter @ scatter, 1e-300)), 0.0, 0.9)
+    lag = min(max(float(scatter[1:] @ scatter[:-1] / max(scatter @ scatter, 1e-300)), 0.0), 0.9)
     return float(np.sqrt((1 + lag) / (1 - lag)))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from .findings import Finding
 from .schema import Curve
-from .signal import Line, point_noise, quantile, runs
+from .signal import Line, differences, point_noise, quantile, runs
 
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
 COARSE = 3.0  # and this many times as many as the channel repeats elsewhere: a coarse read-out repeats every value
@@ -79,7 +79,7 @@ def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: flo
         return []
     at_end = list(zip(starts[last].tolist(), stops[last].tolist(), strict=True))
     least = max(REPEATS, COARSE * quantile(elsewhere, 0.9))
-    moves = np.abs(np.diff(values))
+    moves = np.abs(differences(values))
     step = float(moves[moves > 0].min())
 
     def goes_on(start: int, stop: int) -> bool:

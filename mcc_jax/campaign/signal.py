@@ -29,7 +29,7 @@ def noise_level(values: np.ndarray, span: float) -> float:
     show, nor than what cycles that repeat do from one to the next.
     """
     rounding = _resolution(values, span) / 2
-    third = np.diff(values, 3)
+    third = differences(values, 3)
     if len(values) < LEAST_SAMPLES or (scatter := _scatter(third)) == 0:
         return rounding
     turns = np.array(turning_points(values, DEEP_TURN * span))
@@ -41,7 +41,7 @@ def noise_level(values: np.ndarray, span: float) -> float:
             scatter = min(scatter, _scatter(third[away]))
         inner = values[turns[1:-1]]
         if len(inner) >= LEAST_PEAKS:
-            repeated = max(_scatter(np.diff(ends, 3)) for ends in (inner[::2], inner[1::2]))
+            repeated = max(_scatter(differences(ends, 3)) for ends in (inner[::2], inner[1::2]))
             scatter = min(scatter, SPREAD_OF_PEAKS * repeated)
     return float(np.hypot(scatter, rounding))
 
@@ -53,7 +53,7 @@ def _scatter(third: np.ndarray) -> float:
 
 def _resolution(values: np.ndarray, span: float) -> float:
     """The step of a read-out that is rounded so coarsely that it stays and jumps; else 0."""
-    steps = np.abs(np.diff(values))
+    steps = np.abs(differences(values))
     moves = steps > SMALLEST_STEP * span
     if not moves.any():
         return 0.0
@@ -71,8 +71,15 @@ def point_noise(values: np.ndarray) -> float:
     """Standard deviation from reading to reading: second differences cancel any smooth course."""
     if len(values) < 4:
         return 0.0
-    second = np.diff(values, 2)
+    second = differences(values, 2)
     return float(median(np.abs(second - median(second))) / 0.6745 / np.sqrt(6))
+
+
+def differences(values: np.ndarray, order: int = 1) -> np.ndarray:
+    """As `numpy.diff`, in a quarter of the time for some hundred readings: every test is asked for dozens."""
+    for _ in range(order):
+        values = values[1:] - values[:-1]
+    return values
 
 
 def quantile(values: np.ndarray, share: float) -> float:
@@ -91,7 +98,7 @@ def median(values: np.ndarray) -> float:
 
 def runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where stretches of readings that are equal to the last digit start, and where they stop."""
-    edges = np.concatenate(([0], np.flatnonzero(np.diff(values)) + 1, [len(values)]))
+    edges = np.concatenate(([0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]))
     return edges[:-1], edges[1:]
 
 
@@ -139,11 +146,11 @@ def steady_clock(time: np.ndarray) -> np.ndarray:
 
     Gaps are shortened and repeats spread, so that dwelling is judged by samples that are there.
     """
-    steps = np.diff(time)
+    steps = differences(time)
     if not (steps > 0).any():
         return np.arange(len(time), dtype=float)
-    intervals = steps / median(steps[steps > 0])
-    return np.concatenate(([0.0], np.cumsum(np.clip(intervals, SHORTEST_GAP, LONGEST_GAP))))
+    intervals = np.minimum(steps / median(steps[steps > 0]), LONGEST_GAP)
+    return np.concatenate(([0.0], np.cumsum(np.maximum(intervals, SHORTEST_GAP))))
 
 
 def turning_points(values: np.ndarray, depth: float) -> list[int]:
@@ -153,12 +160,13 @@ def turning_points(values: np.ndarray, depth: float) -> list[int]:
     least `depth`; pairs that are smaller than both their neighbours go together.
     """
     last = len(values) - 1
-    steps = np.diff(values)
+    steps = differences(values)
     moving = np.flatnonzero(steps)
-    turns = moving[1:][np.diff(np.signbit(steps[moving]))]
+    down = steps[moving] < 0
+    turns = moving[1:][down[1:] != down[:-1]]
     index = np.concatenate(([0], turns, [last]))
     while len(index) > 2:
-        ranges = np.abs(np.diff(values[index]))
+        ranges = np.abs(differences(values[index]))
         if ranges.min() >= depth:
             break
         left = np.concatenate(([np.inf], ranges[:-1]))

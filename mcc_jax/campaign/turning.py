@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import Polynomial
 
 from .._format import described
 from .schema import Curve
@@ -126,7 +125,7 @@ def _level(
         rising, falling = parts[0], parts[1]
     meet = _meeting(rising, falling, step)
     (one, first), (other, second) = rising.at(meet), falling.at(meet)
-    steep, down = (float(ramp.course.deriv()(meet)) for ramp in (rising, falling))
+    steep, down = rising.slope(meet), falling.slope(meet)
     # Where two lines meet: each is weighed by the slope of the other.
     weight = down / (down - steep) if steep > 0 > down else 0.5
     level, variance = weight * one + (1 - weight) * other, weight**2 * first + (1 - weight) ** 2 * second
@@ -144,7 +143,7 @@ def _level(
 def _meeting(rising: _Ramp, falling: _Ramp, step: float) -> float:
     """When the ramps before and behind a turning point come closest to each other, from the turning reading on."""
     instants = np.linspace(-step, step, 41)
-    return float(instants[int(np.argmin(np.abs(rising.course(instants) - falling.course(instants))))])
+    return float(instants[int(np.argmin(np.abs(rising.along(instants) - falling.along(instants))))])
 
 
 def _run(near: np.ndarray, start: int, stop: int, direction: int) -> np.ndarray:
@@ -169,14 +168,22 @@ def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.
 class _Ramp(NamedTuple):
     """A line or parabola of force over the time from a turning point, and its covariance for readings of variance 1."""
 
-    course: Polynomial
+    values: np.ndarray
     covariance: np.ndarray
+    unit: float
 
     def at(self, time: float) -> tuple[float, float]:
         """Force and variance."""
-        x = self.course.mapparms()[1] * time
-        powers = x ** np.arange(len(self.covariance))
-        return float(self.course(time)), float(powers @ self.covariance @ powers)
+        x = (time / self.unit) ** np.arange(len(self.values))
+        return float(x @ self.values), float(x @ self.covariance @ x)
+
+    def along(self, time: np.ndarray) -> np.ndarray:
+        """Force at several times."""
+        return (time[:, None] / self.unit) ** np.arange(len(self.values)) @ self.values
+
+    def slope(self, time: float) -> float:
+        k = np.arange(1, len(self.values))
+        return float((k * (time / self.unit) ** (k - 1)) @ self.values[1:] / self.unit)
 
 
 def _fitted(time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, noise: float) -> _Ramp | None:
@@ -188,6 +195,6 @@ def _fitted(time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, no
         values, _, rank, _ = np.linalg.lstsq(design, force, rcond=None)
         left = force - design @ values
         if rank == design.shape[1] and left @ left <= (FITS * noise) ** 2 * len(rows):
-            return _Ramp(Polynomial(values, domain=[-unit, unit]), np.linalg.inv(design.T @ design))
+            return _Ramp(values, np.linalg.inv(design.T @ design), unit)
         rows = np.sort(rows[np.argsort(np.abs(x), kind="stable")[: len(rows) // 2]])
     return None

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .signal import median
+from .signal import differences, median
 
 CONTACT = 0.005  # share of the peak force that is contact: cellulose takes a quarter of its displacement below 3 %
 CONTACT_NOISE = 4.0  # the same in standard deviations of the force's noise, where that is more
@@ -83,7 +83,7 @@ def curve_features(time: np.ndarray, force: np.ndarray, displacement: np.ndarray
             loading_s = float(time[last] - time[first])
             if depth[peak] - depth[peak:].min() > LEAST_RETREAT * way and fullness > 0:
                 loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
-        slope, interval_s = _unloading_slope(load[peak:], depth[peak:]), median(np.diff(time))
+        slope, interval_s = _unloading_slope(load[peak:], depth[peak:]), median(differences(time))
         way = way if way > 0 else np.nan
         return CurveFeatures(force_sign, displacement_sign, height, way, slope, fullness, loss, loading_s, interval_s)
 
@@ -100,7 +100,7 @@ def _without_spikes(values: np.ndarray) -> np.ndarray:
 
 def _noise(values: np.ndarray) -> float:
     """Standard deviation of white noise on a smooth course: its second differences have 6 times the variance."""
-    return 0.0 if len(values) < 8 else 1.4826 * median(np.abs(np.diff(values, 2))) / np.sqrt(6.0)
+    return 0.0 if len(values) < 8 else 1.4826 * median(np.abs(differences(values, 2))) / np.sqrt(6.0)
 
 
 def _contact(rise: np.ndarray) -> tuple[int, float]:
@@ -124,7 +124,8 @@ def _correlation(load: np.ndarray, depth: np.ndarray) -> float:
         load, depth = load[_virgin(load)], depth[_virgin(load)]
     if not (np.ptp(load) > 0 and np.ptp(depth) > 0):
         return 0.0
-    return float(np.corrcoef(load / np.ptp(load), depth / np.ptp(depth))[0, 1])
+    a, b = (load - load.mean()) / np.ptp(load), (depth - depth.mean()) / np.ptp(depth)
+    return float((a @ b) / np.sqrt((a @ a) * (b @ b)))
 
 
 def _unloading_slope(load: np.ndarray, depth: np.ndarray) -> float:
