@@ -94,8 +94,8 @@ def zero_of_force(
             error = float(np.hypot(line.sd / np.sqrt(len(air)), change / np.sqrt(12)))
             return ZeroOfForce(path, float(path[-1]), error, DRIFT.of(change, float(path[-1])))
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
-    said = abs(mean) > max(AIR_SAID * error, least)
-    return ZeroOfForce(mean, mean, error, OFFSET.of(mean) if said else None)
+    reported = abs(mean) > max(AIR_SAID * error, least)
+    return ZeroOfForce(mean, mean, error, OFFSET.of(mean) if reported else None)
 
 
 def open_zero(campaign: Campaign) -> tuple[float, float] | None:

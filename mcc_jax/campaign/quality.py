@@ -124,8 +124,8 @@ def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, flo
     for wrong, finding in ((spikes, SPIKES), (stuck, STUCK)):
         for channel, name in (("force_mN", "force"), ("displacement_um", "displacement")):
             gone = wrong(getattr(clean, channel))
-            said = replace(finding, sentence=finding.sentence.replace("CHANNEL", name))
-            leave_out(gone, said.of(int(gone.sum())))
+            of_channel = replace(finding, sentence=finding.sentence.replace("CHANNEL", name))
+            leave_out(gone, of_channel.of(int(gone.sum())))
     if begins_at_peak(clean):
         found.append(NO_LOADING.of(float(clean.force_mN[0])))
     if (broke := breakage(clean)) is not None:

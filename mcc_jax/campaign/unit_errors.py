@@ -301,12 +301,12 @@ def in_words(error: UnitError) -> tuple[str, str]:
         return "force and displacement seem to be swapped", f"exchange the columns {where}"
     if is_radius(error):
         where = "D1_um, D2_um and D3_um of particles.csv (or --diameters)"
-        said = "the diameters seem to be radii, half of what they should be"
-        return said, f"if they are radii, write twice these values into {where}"
+        problem = "the diameters seem to be radii, half of what they should be"
+        return problem, f"if they are radii, write twice these values into {where}"
     force, way, *sizes, time = map(round, error.decades)
     which = [f"D{i}" for i, decades in enumerate(sizes, start=1) if decades]
     diameters = "diameters" if len(which) == 3 else f"diameters {''.join(which)}"
-    said, remedies = [], []
+    problems, remedies = [], []
     for what, names, decades, units, right in (
         ("forces", ["force"], force, _FORCES, "mN"),
         ("displacements", ["displacement"], way, _LENGTHS, "um"),
@@ -317,7 +317,7 @@ def in_words(error: UnitError) -> tuple[str, str]:
             continue
         unit, times = units[decades], "1000 times" if abs(decades) == 3 else "a million times"
         much, other = ("large", "smaller") if decades < 0 else ("small", "larger")
-        said.append(f"the {what} seem {times} too {much}, as {unit} taken for {right}")
+        problems.append(f"the {what} seem {times} too {much}, as {unit} taken for {right}")
         columns = f"column{'s' if len(names) > 1 else ''} {', '.join(f'{name}_{unit}' for name in names)}"
         file, mapped = "curves.csv", f'in a mapping file: unit = "{unit}"'
         if what == diameters:
@@ -325,4 +325,4 @@ def in_words(error: UnitError) -> tuple[str, str]:
         # The numbers may have been given in any unit; what is known is the factor.
         instead = f"in place of another unit, take the one {times} {other}"
         remedies.append(f"if the {what} are in {unit}, name the {columns} in {file} ({mapped}; {instead})")
-    return " and ".join(said), "; ".join(remedies)
+    return " and ".join(problems), "; ".join(remedies)

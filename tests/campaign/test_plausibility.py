@@ -210,7 +210,7 @@ def test_forces_of_soft_tests_show_where_no_ductile_metal_is_so_strong(unloads):
 
 
 def test_radii_of_hard_spheres_cannot_show():
-    """Half the size with 1.4 times the modulus is another honest sphere; nothing in the record contradicts it."""
+    """Half the size with 1.4 times the modulus is another sound sphere; nothing in the record contradicts it."""
     assert not accusing(check_plausibility(slip(ceramic(), diameters=(0.5,) * 3)))
 
 
@@ -282,7 +282,7 @@ SOLIDS = st.one_of(  # modulus [MPa], hardness / modulus, strain at the peak
     st.floats(1, 3000),
     st.integers(0, 99),
 )
-def test_honest_solids_of_many_kinds_and_sizes(solid, size, flatness, count, unloads, seconds, seed):
+def test_sound_solids_of_many_kinds_and_sizes(solid, size, flatness, count, unloads, seconds, seed):
     modulus, ratio, strain = solid
     rng = np.random.default_rng(seed)
     diameters, curves = [], []
@@ -339,7 +339,7 @@ def read_pebble(file):
     return None if diameter is None or len(rows) < 10 else (diameter, np.array(rows))
 
 
-@pytest.mark.skipif(not PEBBLES.is_dir(), reason="needs the measured pebbles beside the checkout")
+@pytest.mark.skipif(not PEBBLES.is_dir(), reason="needs the measured pebbles next to the checkout")
 @pytest.mark.parametrize(
     "folder", ["FZK_RT", "IPR_1mm", "IPR_batch3", "NFRI_1.5mm_RT", "NFRI_1mm_0.05mms", "NFRI_1mm_0.1mms"]
 )
@@ -357,7 +357,7 @@ def test_measured_pebbles_are_not_accused_and_their_slips_are_named(folder):
         assert says(check_plausibility(slip(tests, **SLIPS[kind][0])), kind)
 
 
-@pytest.mark.skipif(not INSTRUMENTS.is_dir(), reason="needs the measured indentations beside the checkout")
+@pytest.mark.skipif(not INSTRUMENTS.is_dir(), reason="needs the measured indentations next to the checkout")
 @pytest.mark.parametrize("name", ["Exp-50mN_0000.hld", "FS1.txt", "RobinSteel0000LC.txt", "multipleIndentations.zip"])
 def test_indentations_with_a_made_up_diameter_are_not_accused(name):
     read = read_instrument_file(INSTRUMENTS / name, diameters_um=(200.0, 190.0, 180.0))

@@ -77,7 +77,7 @@ def test_the_zero_of_force_in_the_air_is_taken_off_with_its_error(seed, offset_m
         np.testing.assert_array_equal(kept.rows, np.arange(len(raw)))
         np.testing.assert_allclose(curve.force_mN + kept.force_zero_mN, raw.force_mN, atol=1e-9)
         assert np.array_equal(curve.displacement_um, raw.displacement_um)
-        # Noise of 0.05 mN, averaged; hanging together by chance makes it larger, not smaller.
+        # Noise of 0.05 mN, averaged; autocorrelation by chance makes it larger, not smaller.
         alone = 0.05 / np.sqrt(readings)
         assert 0.4 * alone < kept.force_zero_sd_mN < 4 * alone
         assert abs(kept.force_zero_mN - offset_mN) < 5 * kept.force_zero_sd_mN

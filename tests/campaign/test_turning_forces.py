@@ -55,7 +55,7 @@ def truth(name):
 @settings(max_examples=60)
 @given(st.sampled_from(sorted(PATHS)), st.integers(40, 400), st.floats(0.5, 2.0), st.floats(0.0, 0.3))
 def test_of_a_clean_record_the_reading_is_the_level(name, points, slower, bend):
-    """However coarse it is, and wherever the readings beside a turn or a hold fall."""
+    """However coarse it is, and wherever the readings next to a turn or a hold fall."""
     corners = np.array(PATHS[name], float)
     corners[2:, 0] += (slower - 1) * (corners[2, 0] - corners[1, 0])
     time, force = drive(*corners, points=points, bend=bend)
