@@ -21,7 +21,7 @@ from .data import Tests
 from .forward import Point
 from .importance import diagnostics, sample_weighted
 from .marginal import Marginal, ParticleDraw
-from .mode import LogPosterior, handlers, log_densities, populations, seeded
+from .mode import LogPosterior, coordinate_names, handlers, log_densities, populations, seeded
 from .model import Model, coefficients
 from .noise import NoiseFit, Whitening, standard_promotion
 from .particle_fit import ParticleFits

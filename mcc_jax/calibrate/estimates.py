@@ -204,14 +204,14 @@ def laws_of(
 
 def _law(
     content: Mapping[str, Any],
-    C: list[float],
+    C: Any,
     variants: Variants | None,
     entry: Mapping[str, Any] | None = None,
     size: np.ndarray | None = None,
 ) -> MccLaw:
     """The law with these coefficients, and with what differs between particles in the entry of one."""
     a = content["a"]["value"] or 0.0
-    modulus = content["effective_modulus_MPa"]["value"] or RIGID_MPA
+    modulus: Any = content["effective_modulus_MPa"]["value"] or RIGID_MPA
     amplitudes: Mapping[str, Any] = {}
     if entry is not None:
         modulus = (entry.get("effective_modulus_MPa") or {}).get("value") or modulus

@@ -188,8 +188,8 @@ class Model:
         p = self.chosen_priors
         names = ("noise_displacement_um", "noise_force_mN", "noise_correlated_um", "noise_length")
         priors = ((name, getattr(p, name)) for name in names)
-        four = (sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors)
-        return Noise(*four, jnp.ones(count))
+        four = [sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors]
+        return Noise(four[0], four[1], four[2], four[3], jnp.ones(count))
 
     def _filters(self, noise: Noise, point: Point, tests: Tests) -> Whitening:
         """The noise as displacement: how noise of force moves the prediction is taken as known."""

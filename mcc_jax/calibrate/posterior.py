@@ -17,7 +17,7 @@ from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, che
 from ..campaign.findings import worst
 from .compiling import imported_meanwhile, one_blas_thread
 from .data import Selection
-from .draws import Fit, draw_fast, draw_joint, effect_numbers, named_population
+from .draws import Fit, draw_fast, draw_joint, effect_numbers
 from .estimates import effect_entries, finite, summary
 from .fitting import Start, checked_settings, prepare
 from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
@@ -141,10 +141,6 @@ class Posterior(PosteriorDraws):
     def converged(self) -> bool:
         """Whether every gate is passed."""
         return not self.failures()
-
-    def named_population(self) -> dict[str, np.ndarray]:
-        """Draws of the population by the names used in files, shape (chains, draws)."""
-        return named_population(self.population, self.model)
 
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""

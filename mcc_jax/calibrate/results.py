@@ -21,7 +21,7 @@ from ..effects import Variant
 from ..law import MccLaw
 from .curves import FittedCurve, fitted_curves
 from .data import Selection, compared_rows, ranges_um, root_mean_squares
-from .draws import Fit
+from .draws import Fit, named_population
 from .estimates import estimate, finite, force_zero, law_of, log_estimate, quantities
 from .judgement import judged, misfit_note, noise_note, noise_share, unlike_others
 from .model import Model
@@ -218,7 +218,6 @@ class JointCalibration(Calibration):
 class PosteriorDraws(JointCalibration):
     """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
 
-    mode: str
     seed: int
     population: Population
     C: np.ndarray
@@ -228,7 +227,10 @@ class PosteriorDraws(JointCalibration):
     theta: np.ndarray
     log_likelihood: np.ndarray
     pareto_k: np.ndarray
-    divergences: int
+
+    def named_population(self) -> dict[str, np.ndarray]:
+        """Draws of the population by the names used in files, shape (chains, draws)."""
+        return named_population(self.population, self.model)
 
 
 def load(folder: str | Path) -> Any:
