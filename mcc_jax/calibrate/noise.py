@@ -17,7 +17,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -300,8 +299,8 @@ def likelihoods(
     def of_each(logs: Array) -> Array:
         noise = Noise.from_logs(logs, scale)
 
-        def of_one(*test: Any) -> Scalar:
-            left, factor = without_own(noise, *test, zero_sd, correlation, along)
+        def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Scalar:
+            left, factor = without_own(noise, scale, tests, linear, zero_sd, correlation, along)
             return factor - 0.5 * left[-1, -1]
 
         return jax.vmap(of_one)(scale, tests, linear)
@@ -314,7 +313,11 @@ def effects_grams(
     tests: Tests, linear: Linear, noise: Noise, zero_sd: Scalar, correlation: Correlation, along: Along
 ) -> Float[Array, "particles q q"]:
     """Gram matrix of the effects' columns and the residual of each test, the particle's numbers integrated out."""
-    return jax.vmap(lambda *test: without_own(noise, *test, zero_sd, correlation, along)[0])(noise.scale, tests, linear)
+
+    def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Array:
+        return without_own(noise, scale, tests, linear, zero_sd, correlation, along)[0]
+
+    return jax.vmap(of_one)(noise.scale, tests, linear)
 
 
 # Steps of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size.
@@ -365,8 +368,9 @@ def estimate_noise(
     noise = Noise.of(np.exp(found.x), start.scale)
     if not uncertainty:
         return NoiseFit.unsure(noise, converged=bool(found.success))
-    ends = [[value_and_gradient(found.x + step * e)[1] for e in np.eye(4)] for step in (WIDE_STEP, -WIDE_STEP)]
-    curvature = np.subtract(*ends) / (2 * WIDE_STEP)
+    steps = WIDE_STEP * np.eye(4)
+    up, down = (np.array([value_and_gradient(found.x + step)[1] for step in way]) for way in (steps, -steps))
+    curvature = (up - down) / (2 * WIDE_STEP)
     if not np.isfinite(curvature).all():
         return NoiseFit.unsure(noise, converged=False)
     values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
