@@ -204,9 +204,10 @@ class FitCoordinates(eqx.Module):
 
     def particles(self, position: Array) -> tuple[Population, ParticleDraw]:
         """Population, and particles under it."""
-        marginal, population = self.target.marginal, self.target.population(self.free(position))
-        own = position[len(self.mode) :].reshape(len(marginal.flatness), -1)
-        return population, marginal.draw(population, own[:, :-1], own[:, -1])
+        assert self.exact is not None
+        population = self.target.population(self.free(position))
+        own = position[len(self.mode) :].reshape(len(self.exact.tests), -1)
+        return population, self.exact.marginal.draw(population, own[:, :-1], own[:, -1])
 
     def log_density(self, position: Array) -> Array:
         """Log density, up to a constant."""
