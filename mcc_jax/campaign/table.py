@@ -350,12 +350,13 @@ def plain_table(text: str, file: Path, names: str) -> Table | None:
     if '"' in text or names not in cells or filled(cells) < len(cells):
         return None
     header = _header(cells, file)
-    types: Any = {name: object if name == names else float for name in header}
+    # Columns have numbers, since pandas keeps names as Arrow strings, which would reserve a GiB for a few letters.
+    types: Any = {i: object if name == names else float for i, name in enumerate(header)}
     try:  # without the filter of missing values, cells that are empty or too few are errors
-        frame = pd.read_csv(io.BytesIO(text.encode()), header=0, names=header, dtype=types, na_filter=False)
+        frame = pd.read_csv(io.BytesIO(text.encode()), header=0, names=list(types), dtype=types, na_filter=False)
     except ValueError:
         return None
-    columns = [frame[name].tolist() if name == names else frame[name].to_numpy() for name in header]
+    columns = [frame[i].to_numpy() if kind is float else frame[i].tolist() for i, kind in types.items()]
     # An index: there were more cells than names. Other lines: some were empty, or lines end otherwise.
     whole = isinstance(frame.index, pd.RangeIndex) and len(frame) == body.count("\n") + 1
     if whole and all((np.abs(column) <= _LARGEST_NUMBER).all() for column in columns if not isinstance(column, list)):
