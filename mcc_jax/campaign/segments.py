@@ -148,8 +148,8 @@ class Drive:
         """The index (fractional) at which a branch, counted in its own direction, passes a level."""
         envelope = self.envelopes[branch]
         k = int(np.searchsorted(envelope, level))
-        if k <= 0 or k >= len(envelope):
-            return float(self.turns[branch] + min(max(k, 0), len(envelope) - 1))
+        if k in (0, len(envelope)):
+            return float(self.turns[branch] + min(k, len(envelope) - 1))
         low, high = envelope[k - 1], envelope[k]
         return float(self.turns[branch] + k - 1 + (level - low) / (high - low))
 
@@ -165,16 +165,14 @@ class Drive:
 
     def _edge(self, branch: int, level: float, at: int, *, rising: bool) -> tuple[float, float]:
         """The time at which a branch's ramp, drawn on straight, meets a level, and the time it takes for one band."""
-        envelope = self.envelopes[branch]
-        if rising:
-            near_level, far_level = level - self.band, max(level - 3 * self.band, envelope[0])
-        else:
-            near_level, far_level = level + self.band, min(level + 3 * self.band, envelope[-1])
+        envelope, away = self.envelopes[branch], -1 if rising else 1
+        near_level = level + away * self.band
+        far_level = min(max(level + away * 3 * self.band, envelope[0]), envelope[-1])
         near, far = self._time(self._crossing(branch, near_level)), self._time(self._crossing(branch, far_level))
         # One band's crossing is blurred by noise; two are taken where the branch is deep enough.
         pace = abs(near - far) * self.band / max(abs(near_level - far_level), 0.5 * self.band)
-        turn = float(self.clock[at])
-        return (min(near + pace, turn) if rising else max(near - pace, turn)), pace
+        turn, meets = float(self.clock[at]), near - away * pace
+        return (min(meets, turn) if rising else max(meets, turn)), pace
 
     def _hold_at_turn(self, turn: int) -> Hold | None:
         at, left, right = self.turns[turn], turn - 1, turn
