@@ -38,6 +38,29 @@ OF_VERDICTS: dict[str, Level] = {"NO_GAP": "good", "FIT_NOT_CONVERGED": "bad"}
 """What a verdict means for the law without what was found; "look" if something was."""
 
 
+MEANINGS = {
+    "Calibration converged": "Every part of the calibration must meet its own tolerances. If not: the numbers are not "
+    "to be trusted before the checks below have passed.",
+    "Particles used": "Few particles say little of how particles differ. Why some are left out is under The tests.",
+    "Chains agree (R-hat)": "Independent chains must agree. If not: more draws (--draws).",
+    "Independent draws (bulk ESS)": "Number of independent draws that the chains are worth. If too few: more draws "
+    "(--draws).",
+    "Diverging trajectories": "The sampler could not follow the posterior everywhere. If not 0: more draws, or "
+    "narrower priors.",
+    "Fast mode is accurate (Pareto k)": "How well the quadratic summaries of the fast mode approximate the tests "
+    "themselves. If not: --mode joint.",
+    "The law's form fits": "Median misfit with each particle's own coefficients, as a share of its range of "
+    "displacement. If large: these may be no compressions of single particles, or the diameters are wrong.",
+    "What is left is noise": "Share of what is left that is correlated along a test. A large one is not noise of the "
+    "instrument but something that the law misses, and the stated errors are those of a law that misses it.",
+    "New particles behave": "Share of particles drawn from this population whose loading curve would fall somewhere.",
+    "Prediction bands hold": "Measured points inside the band that should hold 95 % of them. Fewer: the law misses "
+    "something, or the noise is larger than estimated. More: the noise is smaller.",
+    "Same data": "The data shown here are those that were calibrated. If not: calibrate again.",
+}
+"""What a check says, and what to do where it fails."""
+
+
 @dataclass(frozen=True)
 class Check:
     """What is checked, what was found, what it should be, and what that means; "look" is to be used with care."""
@@ -63,13 +86,9 @@ def check_results(results: Results, shown: Sequence[FittedCurve] = ()) -> list[C
         found += _fit(content)
     inside = share_inside(shown)
     if inside is not None:
-        text = (
-            "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the "
-            "noise is larger than estimated. More: the noise is smaller."
-        )
-        level, want = "good" if INSIDE[0] <= inside <= INSIDE[1] else "look", f"{percent(INSIDE[0])} to "
-        want = f"about 95 %, {want}{percent(INSIDE[1])}"
-        found.append(Check(level, "Prediction bands hold", f"{percent(inside, 3)} of points inside", want, text))
+        level = "good" if INSIDE[0] <= inside <= INSIDE[1] else "look"
+        want = f"about 95 %, {percent(INSIDE[0])} to {percent(INSIDE[1])}"
+        found.append(_check("Prediction bands hold", level, f"{percent(inside, 3)} of points inside", want))
     if content is not None:
         found.append(_data(results))
     if results.discovery is not None:
@@ -98,12 +117,16 @@ def share_inside(shown: Sequence[FittedCurve]) -> float | None:
     return float(np.mean(np.concatenate(inside))) if sum(map(len, inside)) else None
 
 
-def _gate(check: str, value: float | int | None, good: float, bad: float, text: str, want: str, meaning: str) -> Check:
+def _check(check: str, level: Level, value: str, want: str) -> Check:
+    return Check(level, check, value, want, MEANINGS[check])
+
+
+def _gate(check: str, value: float | int | None, good: float, bad: float, text: str, want: str) -> Check:
     """A number that is fine up to one limit and to be used with care up to another."""
     level: Level = "unknown"
     if value is not None:
         level = "good" if value <= good else "look" if value <= bad else "bad"
-    return Check(level, check, text, want, meaning)
+    return _check(check, level, text, want)
 
 
 def _calibration(content: dict[str, Any]) -> list[Check]:
@@ -111,46 +134,21 @@ def _calibration(content: dict[str, Any]) -> list[Check]:
     enough = "good" if used == count >= FEW_PARTICLES else "look" if used >= max(2, count / 2) else "bad"
     done = content["converged"]
     return [
-        Check(
-            "good" if done else "bad",
-            "Calibration converged",
-            "yes" if done else "no",
-            "yes",
-            "Every part of the calibration must meet its own tolerances. If not: the numbers are not to be trusted "
-            "before the checks below have passed.",
-        ),
-        Check(
-            enough,
-            "Particles used",
-            f"{used} of {count}",
-            f"all, and at least {FEW_PARTICLES}",
-            "Few particles say little of how particles differ. Why some are left out is said under The tests.",
-        ),
+        _check("Calibration converged", "good" if done else "bad", "yes" if done else "no", "yes"),
+        _check("Particles used", enough, f"{used} of {count}", f"all, and at least {FEW_PARTICLES}"),
     ]
 
 
 def _sampler(d: dict[str, Any]) -> list[Check]:
     rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
     k = None if k is None else max(k, d.get("pareto_k_joint") or k)
+    few, least = None if ess is None else -ess, f"at least {LEAST_ESS:.0f}"
+    most = f"at most {MOST_PARETO_K}"
     return [
-        _gate(
-            *("Chains agree (R-hat)", rhat, MOST_RHAT, RHAT_BAD, number(rhat), f"at most {MOST_RHAT}"),
-            "Independent chains must agree. If not: more draws (--draws).",
-        ),
-        _gate(
-            *("Independent draws (bulk ESS)", None if ess is None else -ess, -LEAST_ESS, -ESS_BAD, number(ess)),
-            f"at least {LEAST_ESS:.0f}",
-            "Number of independent draws that the chains are worth. If too few: more draws (--draws).",
-        ),
-        _gate(
-            *("Diverging trajectories", divergences, 0.0, 0.0, number(divergences), "0"),
-            "The sampler could not follow the posterior everywhere. If not 0: more draws, or narrower priors.",
-        ),
-        _gate(
-            *("Fast mode is accurate (Pareto k)", k, MOST_PARETO_K, PARETO_K_BAD, number(k, 2)),
-            f"at most {MOST_PARETO_K}",
-            "How well the quadratic summaries of the fast mode approximate the tests themselves. If not: --mode joint.",
-        ),
+        _gate("Chains agree (R-hat)", rhat, MOST_RHAT, RHAT_BAD, number(rhat), f"at most {MOST_RHAT}"),
+        _gate("Independent draws (bulk ESS)", few, -LEAST_ESS, -ESS_BAD, number(ess), least),
+        _gate("Diverging trajectories", divergences, 0.0, 0.0, number(divergences), "0"),
+        _gate("Fast mode is accurate (Pareto k)", k, MOST_PARETO_K, PARETO_K_BAD, number(k, 2), most),
     ]
 
 
@@ -160,23 +158,14 @@ def _fit(content: dict[str, Any]) -> list[Check]:
     falling = (content.get("probability_not_monotone") or {}).get("value")
     found = []
     if misfit is not None:
-        text = (
-            "Median misfit with each particle's own coefficients, as a share of its range of displacement. If large: "
-            "these may be no compressions of single particles, or the diameters are wrong."
-        )
         value, want = f"off by {percent(misfit)}", f"at most {percent(GOOD_MISFIT)}"
-        found.append(_gate("The law's form fits", misfit, GOOD_MISFIT, LARGE_MISFIT, value, want, text))
+        found.append(_gate("The law's form fits", misfit, GOOD_MISFIT, LARGE_MISFIT, value, want))
     if noise is not None:
-        text = (
-            "Share of what is left that is correlated along a test. A large one is not noise of the instrument but "
-            "something that the law misses, and the stated errors are those of a law that misses it."
-        )
         value, want = f"{percent(noise)} is autocorrelated", f"at most {percent(GOOD_NOISE_SHARE)}"
-        found.append(_gate("What is left is noise", noise, GOOD_NOISE_SHARE, CORRELATED_SHARE, value, want, text))
+        found.append(_gate("What is left is noise", noise, GOOD_NOISE_SHARE, CORRELATED_SHARE, value, want))
     if falling is not None:
-        text = "Share of particles drawn from this population whose loading curve would fall somewhere."
         value, want = f"{percent(falling)} snap through", f"at most {percent(NOT_MONOTONE)}"
-        found.append(_gate("New particles behave", falling, NOT_MONOTONE, math.inf, value, want, text))
+        found.append(_gate("New particles behave", falling, NOT_MONOTONE, math.inf, value, want))
     name = "Data determine the parameters"
     gaps = d.get("open_combinations", [])
     return found + [Check("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
@@ -187,10 +176,8 @@ def _data(results: Results) -> Check:
     tests, name, want = results.provenance[CALIBRATION].campaign, "Same data", "checksums agree"
     if tests is None or not tests.sha256 or not results.checksums:
         return Check("unknown", name, "unknown", want, "Checksums or the campaign's files are missing.")
-    same = all(results.checksums.get(name) == tests.sha256.get(name) for name in DATA)
-    meaning = "The data shown here are those that were calibrated. If not: calibrate again."
-    level = "good" if same and not results.cautions else "bad"
-    return Check(level, name, want if same else "checksums differ", want, meaning)
+    same = all(results.checksums.get(file) == tests.sha256.get(file) for file in DATA)
+    return _check(name, "good" if same and not results.cautions else "bad", want if same else "checksums differ", want)
 
 
 def _complete(results: Results, found: dict[str, Any]) -> Check:

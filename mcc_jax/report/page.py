@@ -43,7 +43,7 @@ CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
     "fits": ("compare", "Measured curves and the joint fit"),
     "particles": ("compare", "Measured curves, the mean law, and each particle's own coefficients"),
-    "residuals": ("compare", "What the law leaves, over strain"),
+    "residuals": ("compare", "What the law leaves, over force"),
     "whitened": ("compare", "Residuals freed of their correlation, which should be noise"),
     "dimensions": ("measured", "Sizes and shapes of the particles"),
     "curves": ("measured", "All curves"),
