@@ -184,7 +184,8 @@ def advance(
                 state = rebuild_list(packing, state, skin)
                 made += 1
         check_state(state)
-        row = state.time, state.walls, on_wall / steps, *measured(packing, state), made, state.edges.capacity
+        capacity = state.edges.capacity
+        row: tuple[Any, ...] = (state.time, state.walls, on_wall / steps, *measured(packing, state), made, capacity)
         table.append(Trajectory(*row))
     return state, jax.tree.map(lambda *column: np.stack(column), *table)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,7 +20,7 @@ from .state import Packing, State, Vectors, WallHistory
 from .walls import Vector, Wall, Walls, dot
 
 
-def _share(value: ScalarLike | None) -> Scalar | None:
+def _share(value: ScalarLike | None) -> Any:
     arguments.positive(0.0 if value is None else value, "a number of an interaction [-]", zero=True, plain=True)
     return None if value is None else scalar(value)
 
