@@ -107,7 +107,7 @@ def random_paths(rng, laws, diameters, steps=24):
 
 
 @eqx.filter_jit
-@eqx.filter_vmap(in_axes=(0, 0, 0, 0, 0, None))
+@eqx.filter_vmap(in_axes=(eqx.if_array(0), 0, 0, 0, 0, None))  # a switch of an effect is a plain number
 def along(law, diameters, others, path, peak, kind):
     """The library's forces [N] and tangents [N/m] along a path [m]; a platen test is two halves against walls."""
     side, other = (half_contact(law, Particle(*d)) for d in (diameters, others))
