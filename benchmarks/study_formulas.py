@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -28,13 +27,10 @@ import numpy as np
 
 import mcc_jax as mcc
 from mcc_jax.discovery.base import Base, base_fit
-from mcc_jax.discovery.candidates import Candidate, candidates_of, located
-from mcc_jax.discovery.columns import with_amplitudes
 from mcc_jax.discovery.design import design_of
 from mcc_jax.discovery.evidence import LinearModel, visible
-from mcc_jax.discovery.misfit import coordinates, scaled
-from mcc_jax.discovery.misfit_form import misfit_columns
-from mcc_jax.discovery.screen import signature_columns
+from mcc_jax.discovery.misfit import coordinates, functions, misfit_columns, scaled
+from mcc_jax.discovery.screen import Candidate, candidates_of, located, with_signatures
 from mcc_jax.discovery.settings import DECISIONS
 from mcc_jax.effects import LIBRARY, Variant
 
@@ -69,7 +65,7 @@ def campaign(effects: Sequence[mcc.HiddenEffect] = ()) -> mcc.Campaign:
 
 def gram(base: Base, columns: Any) -> np.ndarray:
     """Products of columns in units of noise, particles' own numbers and the population integrated out."""
-    design = with_amplitudes(design_of(base, base.state), columns)
+    design = design_of(base, base.state).with_amplitudes(columns)
     return LinearModel(base.hyperparameters, design).shared().information
 
 
@@ -89,10 +85,10 @@ def in_span(
     unit = min(LAMBDA / np.sqrt(products[0, 0]), truth.plausible[1] / truth.plausible[0])
     amplitude = unit * products[0, 1] / products[1, 1]
     siblings = {name: columns[..., j] for name, j in best.items()}
-    fitted: Any = SimpleNamespace(variants=(sibling,), curves_um=amplitude * columns[..., s : s + 1])
     here = design_of(base, base.state)
     seen = visible(base.hyperparameters, here, columns[..., s : s + 1])[0]
-    span = seen * misfit_columns(fitted, 0, at, lambda _: siblings, LIBRARY)
+    smooth = functions(LIBRARY[sibling.mechanism].coordinates, at)
+    span = seen * misfit_columns(sibling, amplitude * columns[..., s], smooth, siblings)
     count = span.shape[-1]
     products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))
     alone = remaining(products[:2, :2], np.zeros(1))
@@ -109,7 +105,7 @@ def rows_of(base: Base, candidates: list[Candidate]) -> list[Row]:
     """Every formula at the middle of its further numbers, left out in turn."""
     variants = list(dict.fromkeys(c.variant for c in candidates))
     every = [*at_their_middle(variants), *candidates]
-    columns = signature_columns(base, base.state, every)
+    columns = with_signatures(base, base.state, every).columns
     at = scaled(
         {
             k: np.asarray(x)
@@ -146,8 +142,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     jax.config.update("jax_enable_x64", True)
     base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, progress=lambda _: None)
-    assert base.converged
-    assert not base.snapping
+    assert not base.snaps.any()
     candidates = [c for c in candidates_of(LIBRARY) if not (c.variant.random_per_test or located(c.variant))]
     head = "| mechanism | formula | sd | best sibling | left | in the span | rest [sd] |\n" + "|---" * 7 + "|\n"
     text = head + "".join(map(line, rows_of(base, candidates)))

@@ -26,8 +26,7 @@ from study_formulas import at_their_middle, campaign, gram
 import mcc_jax as mcc
 from mcc_jax.discovery import discover
 from mcc_jax.discovery.base import base_fit
-from mcc_jax.discovery.candidates import located
-from mcc_jax.discovery.screen import signature_columns
+from mcc_jax.discovery.screen import located, with_signatures
 from mcc_jax.effects import LIBRARY, Variant
 
 RESULTS = Path(__file__).parent / "results"
@@ -52,7 +51,7 @@ def solve(part: int, parts: int, strength: float) -> None:
     """Answer every `parts`-th formula, from the `part`-th on."""
     base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, progress=lambda _: None)
     variants = [v for m in LIBRARY.values() for v in m.variants if not (v.random_per_test or located(v))]
-    product = gram(base, signature_columns(base, base.state, at_their_middle(variants)))
+    product = gram(base, with_signatures(base, base.state, at_their_middle(variants)).columns)
     sd = np.sqrt(np.diagonal(product))
     units = np.minimum(strength / sd, [v.plausible[1] / v.plausible[0] for v in variants])
     sign, cosine = np.array([v.sign or 0 for v in variants]), product / np.outer(sd, sd)

@@ -1,50 +1,54 @@
-"""From a search to its answer: effects with their numbers, sets, rankings, residuals, what remains."""
+"""From a search to its answer: parameters of the law, effects with their numbers, sets, rankings, what remains."""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.special import softmax
 
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
-from ..effects import Mechanism
-from .at_peaks import of_modulus_at_peaks
+from ..calibrate.forward import Forms
+from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD, Record
+from ..geometry import Particle
 from .base import Base
-from .columns import Design
-from .design import design_of
-from .evidence import LinearModel, residual_of, whitened
-from .fit import Fitted
-from .hypothesis import UNLISTED, Hypothesis, Names
-from .random_effects import RandomEffects
-from .result import Effect, Likeness, Residuals
+from .design import Design, further_priors
+from .evidence import LinearModel, Solution, residual_of, whitened
+from .fit import Fitted, moved
+from .hypothesis import UNLISTED, Names, RandomEffects
+from .result import Effect, Likeness, Place, Residuals
 from .search import Search
 from .settings import AT_PEAKS, DECISIONS, DETECTABLE, POPULATION
 
+KINDS = {LOAD: "loading", HOLD: "hold", UNLOAD: "unloading", RELOAD: "reloading"}
+BINS = 5  # of load in which disagreement is looked for
+REPORTED = 0.85  # places are reported until they hold this share of the disagreement
 LEAD = 3.0  # log posterior odds from which on what remains next to a name is reported
 
 
-def parameters_alone(base: Base) -> dict[str, Any]:
-    """The population's parameters by the law alone, under the model's own noise: those of a calibration."""
-    alone = _population(base, None, base.hyperparameters, design_of(base, base.state))
-    return _averaged([alone], np.ones(1), len(base.tests))
-
-
-def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
+def parameters_with(search: Search) -> dict[str, Any]:
     """The population's parameters, averaged over hypotheses (Bayesian model averaging, Hoeting et al. 1999).
 
-    The sum of the `probabilities` of those that are averaged over need not be 1.
+    These are the most probable ones that are fitted, as many as hold what a set must.
     """
-    found = [search.found[names] for names in probabilities]
-    each = [_population(search.base, one.at, *one.likely_form()) for one in found]
-    weights = np.array(list(probabilities.values())) / sum(probabilities.values())
-    return _averaged(each, weights, len(search.base.tests))
+    likely: dict[Names, float] = {}
+    for names, probability in search.posterior().items():
+        if sum(likely.values()) < DECISIONS.set_mass and search.found[names].at is not None:
+            likely[names] = probability
+    found = [search.found[names] for names in likely]
+    each = [population_under(search.base, one.at, *one.likely_form()) for one in found]
+    return averaged(each, np.array(list(likely.values())) / sum(likely.values()), len(search.base.tests))
 
 
-def _averaged(
+def averaged(
     each: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], weights: np.ndarray, particles: int
 ) -> dict[str, Any]:
     """Parameters by name from means, errors and spreads, which are weighted.
@@ -52,6 +56,7 @@ def _averaged(
     The mean of log C over particles whose spread is estimated from the same particles follows Student's t with one
     degree of freedom less than there are particles; a and the modulus, which no spread of particles limits, are normal.
     """
+    from scipy.optimize import root_scalar
     from scipy.stats import t as student
 
     mean, sd, tau = (np.array(parts) for parts in zip(*each, strict=True))
@@ -60,37 +65,31 @@ def _averaged(
     wider = np.where(freedom > 2, student.std(freedom), 1.0)
     middle = weights @ mean
     wide = np.sqrt(weights @ ((sd * wider) ** 2 + (mean - middle) ** 2))
-    low, high = (_quantiles(q, weights, mean, sd, freedom) for q in (0.025, 0.975))
-    spread = weights @ tau
+    far = student.ppf(0.999, freedom) * sd
+    least, most = np.min(mean - far, 0), np.max(mean + far, 0)
+
+    def quantile(q: float, j: int) -> float:
+        """Of the mixture of Student's t distributions, normal ones of infinite freedom."""
+
+        def below(x: float) -> float:
+            return float(weights @ student.cdf((x - mean[:, j]) / sd[:, j], freedom[j])) - q
+
+        return root_scalar(below, bracket=(least[j], most[j])).root
 
     def entry(j: int) -> dict[str, Any]:
-        return estimate(float(middle[j]), float(wide[j]), (low[j], high[j]))
+        return estimate(float(middle[j]), float(wide[j]), (quantile(0.025, j), quantile(0.975, j)))
 
     def modulus(j: int) -> dict[str, Any]:
-        value = float(np.exp(middle[j]))
-        return estimate(value, value * float(wide[j]), (float(np.exp(low[j])), float(np.exp(high[j]))))
+        value = math.exp(middle[j])
+        return estimate(value, value * float(wide[j]), (math.exp(quantile(0.025, j)), math.exp(quantile(0.975, j))))
 
-    return {
-        "a": entry(0),
-        "effective_modulus_MPa": modulus(1),
-        AT_PEAKS: modulus(5),
-        **{
-            f"log_{name}": {"mean": entry(2 + j), "sd": estimate(float(spread[j]))}
-            for j, name in enumerate(("C1", "C3", "C5"))
-        },
+    coefficients = {
+        f"log_C{2 * j + 1}": {"mean": entry(2 + j), "sd": estimate(float(weights @ tau[:, j]))} for j in range(3)
     }
+    return {"a": entry(0), "effective_modulus_MPa": modulus(1), AT_PEAKS: modulus(5), **coefficients}
 
 
-def likely(search: Search) -> dict[Names, float]:
-    """The most probable hypotheses that are fitted, as many as hold what a set must."""
-    found: dict[Names, float] = {}
-    for names, probability in search.posterior().items():
-        if sum(found.values()) < DECISIONS.set_mass and search.found[names].at is not None:
-            found[names] = probability
-    return found
-
-
-def _population(
+def population_under(
     base: Base, formulas: Fitted | None, hyper: np.ndarray, design: Design
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, and the
@@ -105,7 +104,7 @@ def _population(
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
     rows = np.zeros((POPULATION + 1, len(covariance)))
     rows[:POPULATION, :POPULATION] = factor
-    change, slope = (0.0, np.zeros(0)) if formulas is None else of_modulus_at_peaks(base, formulas, solution)
+    change, slope = (0.0, np.zeros(0)) if formulas is None else _modulus_at_peaks(base, formulas, solution)
     names = 0 if formulas is None else len(formulas.variants)
     rows[-1] = rows[1]
     rows[-1, width : width + names] += slope[:names]
@@ -116,39 +115,57 @@ def _population(
     return np.append(beta, at_peaks), sd, model.scales[0][:3]
 
 
-def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray, freedom: np.ndarray) -> list[float]:
-    """Quantiles of mixtures of Student's t distributions (normal ones of infinite freedom), one a column."""
-    from scipy.optimize import root_scalar
-    from scipy.stats import t as student
+def _modulus_at_peaks(base: Base, formulas: Fitted, solution: Solution) -> tuple[float, np.ndarray]:
+    """Mean logarithm of what effects make of the modulus at every test's largest force, and its derivatives.
 
-    def below(x: float, j: int) -> float:
-        return float(weights @ student.cdf((x - mean[:, j]) / sd[:, j], freedom[j])) - q
+    Each formula has a strain, a size or a humidity of its own at which its modulus is that of the law: extrapolated
+    there, it may be twice what acts in the tests. At their peaks all formulas that describe the tests agree.
+    Derivatives are by the amplitudes and then by the further numbers, each in units of its column.
+    """
+    variants, names = formulas.variants, len(formulas.variants)
+    forms, state = Forms(base.model.unloading, variants), formulas.state
+    at = jnp.asarray(moved(base, state, variants, solution).point.theta[0])
+    if not any(effect.overrides("modify", "stiffness") for effect in forms.build(at)):
+        return 0.0, np.zeros(len(at))
 
-    far = student.ppf(0.999, freedom) * sd
-    low, high = np.min(mean - far, 0), np.max(mean + far, 0)
-    return [root_scalar(below, args=(j,), bracket=(low[j], high[j])).root for j in range(mean.shape[1])]
+    def mean(numbers: Array) -> tuple[Array, Array]:
+        def one(latent: Array, particle: Particle, record: Record) -> Array:
+            law = forms.law(latent, numbers)
+            context = law.context(particle, record)
+            factors = (effect.stiffness(context)[record.force.argmax()] for effect in law.effects)
+            factor = math.prod(factors, start=jnp.ones(()))
+            return jnp.log(factor * context.law.effective_modulus / law.effective_modulus)
+
+        found = jax.vmap(one)(state.point.latent, base.tests.particle, base.tests.record).mean()
+        return found, found  # the value, too
+
+    _, sd, positive = further_priors(variants)
+    units = [*(v.plausible[0] for v in variants), *sd * np.where(positive, at[names:], 1.0)]
+    slope, value = jax.jacfwd(mean, has_aux=True)(at)
+    return float(value), np.asarray(slope) * np.array(units)
 
 
-def effects_of(search: Search, names: Names, probabilities: Mapping[str, float], p_any: float) -> tuple[Effect, ...]:
+def effects_of(search: Search, names: Names, p_any: float) -> tuple[Effect, ...]:
     """The effects of a hypothesis with their numbers."""
-    one = search.found[names]
-    own = () if one.own is None else (_of_their_own(one.own, probabilities[one.own.variant.mechanism], p_any),)
+    one, posterior = search.found[names], search.posterior()
     r = one.at
     if r is None:
         return ()
+    # Of each mechanism to be missing, if anything is.
+    gap = max(1.0 - posterior.get((), 0.0), 1e-300)
+    probability = {m: sum(p for names, p in posterior.items() if m in names) / gap for m in search.library}
     # As wide as with the misfit and the scatter that the tests prefer, as the population's parameters are.
     hyper, design = one.likely_form()
-    cov, c = LinearModel(hyper, design).covariance(), design.common.shape[-1]
-    place, found = len(r.variants), []
+    errors = np.sqrt(np.diagonal(LinearModel(hyper, design).covariance()))[design.common.shape[-1] :]
+    further, found = iter(r.theta[len(r.variants) :]), []
     for k, variant in enumerate(r.variants):
-        nuisance = {n.name: float(r.theta[place + i]) for i, n in enumerate(variant.nuisances)}
-        place += len(nuisance)
-        sd = float(np.sqrt(cov[c + k, c + k])) * variant.plausible[0]
+        nuisance = {n.name: float(next(further)) for n in variant.nuisances}
+        amplitude, sd = float(r.theta[k]), float(errors[k]) * variant.plausible[0]
         size = one.sizes[k] if k < len(one.sizes) and one.is_off else 0.0
-        amplitude = float(r.theta[k])
-        found.append(Effect(variant, nuisance, amplitude, sd, probabilities[variant.mechanism], p_any, misfit=size))
-    order = {name: i for i, name in enumerate(sorted(names, key=lambda n: -search.found[(n,)].log_evidence))}
-    return tuple(sorted((*found, *own), key=lambda e: order[e.mechanism]))
+        found.append(Effect(variant, nuisance, amplitude, sd, probability[variant.mechanism], p_any, misfit=size))
+    if one.own is not None:
+        found.append(_of_their_own(one.own, probability[one.own.variant.mechanism], p_any))
+    return tuple(sorted(found, key=lambda e: -search.found[(e.mechanism,)].log_evidence))
 
 
 def _of_their_own(own: RandomEffects, probability: float, p_any: float) -> Effect:
@@ -167,23 +184,23 @@ def _of_their_own(own: RandomEffects, probability: float, p_any: float) -> Effec
 
 def with_draws(effect: Effect, posterior: Posterior) -> Effect:
     """The effect with its numbers from the posterior."""
-    named = posterior.named_population()
-    amplitude = named[effect.mechanism]
-    further = {n.name: named[f"{effect.mechanism}.{n.name}"] for n in effect.variant.nuisances}
+    draws = posterior.named_population()
+    amplitude = draws[effect.mechanism]
+    further = {n.name: draws[f"{effect.mechanism}.{n.name}"] for n in effect.variant.nuisances}
     return replace(
         effect,
         amplitude=float(amplitude.mean()),
         sd=float(amplitude.std()),
-        nuisance={name: float(draws.mean()) for name, draws in further.items()},
-        estimates={effect.variant.parameter: summary(amplitude)} | {n: summary(d) for n, d in further.items()},
+        nuisance={name: float(each.mean()) for name, each in further.items()},
+        estimates={effect.variant.parameter: summary(amplitude)} | {n: summary(each) for n, each in further.items()},
     )
 
 
-def name_probabilities(search: Search) -> dict[str, float]:
-    """Probability of each mechanism to be missing, if anything is."""
-    found = search.posterior()
-    gap = max(1.0 - found.get((), 0.0), 1e-300)
-    return {m: sum(p for names, p in found.items() if m in names) / gap for m in search.library}
+def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
+    """Two names that together may be in place of the one that is named, most probable first."""
+    left_out = 1.0 - DECISIONS.set_mass
+    pairs = (n for n, p in search.posterior().items() if len(n) == 2 and p > left_out)
+    return tuple(n for n in pairs if len(leader) == 1 and leader[0] not in n)
 
 
 def sets_of(
@@ -217,110 +234,124 @@ def _shares(logs: Mapping[str, float]) -> dict[str, float]:
     return dict(zip(logs, softmax(list(logs.values())).tolist(), strict=True))
 
 
-def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
-    """Two names that together may be in place of the one that is named, most probable first."""
-    if len(leader) != 1:
+def leads_of(search: Search, winner: Names) -> tuple[dict[str, Any], ...]:
+    """Second names that improve on the winner without leading it by the margin."""
+    if len(winner) != 1 or winner == UNLISTED:
         return ()
-    left_out = 1.0 - DECISIONS.set_mass
-    return tuple(n for n, p in search.posterior().items() if len(n) == 2 and leader[0] not in n and p > left_out)
+    alone = search.found[winner].log_evidence
+    gap = max(alone - search.null.log_evidence, 1e-300)
+    found = []
+    for names, pair in search.found.items():
+        gain = pair.log_evidence - alone
+        if len(names) == 2 and winner[0] in names and gain > LEAD:
+            (second,) = set(names) - set(winner)
+            found.append({"mechanism": second, "share": float(gain / (gap + gain)), "resembles": []})
+    return tuple(sorted(found, key=lambda lead: -lead["share"]))
 
 
 def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
     """Every mechanism alone against the base law, most probable first."""
     logs = {m: search.found[(m,)].log_evidence if (m,) in search.found else -np.inf for m in search.library}
     probability = _shares(logs)
-    own = {m: x for m, x in search.library.items() if m not in search.shared}
-    views = [search.screen] if search.screen is not None else []
-    if own:
-        views.append(search.screened(own, several=False))
-    entries = {}
-    for view in views:
-        first = view.settings[0]
+    entries: dict[str, dict[str, Any]] = {}
+    of_their_own = [search.screened(search.not_shared, several=False)] if search.not_shared else []
+    for view in [search.screen, *of_their_own]:
+        score, value = view.score[0], view.singles()
         information = np.maximum(view.information, 1e-300)
-        z = first.score / np.sqrt(information)
-        value, _ = view.singles()
-        shown = view.information > 1e-12 * view.information.max()  # a formula that leaves no trace says nothing
+        z = score / np.sqrt(information)
+        shown = view.information > 1e-12 * view.information.max(initial=0.0)  # a formula without a trace says nothing
         for k in np.argsort(np.where(shown, -value, np.inf)):
-            c = view.candidates[k]
-            if c.mechanism in entries:
-                continue
-            unit = c.variant.plausible[0]
-            entries[c.mechanism] = {
-                "mechanism": c.mechanism,
-                "variant": c.variant.name,
+            v = view.candidates.each[k].variant
+            entry = {
+                "mechanism": v.mechanism,
+                "variant": v.name,
                 "statistic": finite(float(z[k])),
-                "estimate": finite(float(first.score[k] / information[k] * unit)),
-                "detection_limit": finite(float(DETECTABLE / np.sqrt(information[k]) * unit)),
-                "unit": c.variant.unit,
-                "parameter": c.variant.parameter,
-                "probability": probability[c.mechanism],
-                "sign": c.variant.sign,
+                "estimate": finite(float(score[k] / information[k] * v.plausible[0])),
+                "detection_limit": finite(float(DETECTABLE / np.sqrt(information[k]) * v.plausible[0])),
+                "unit": v.unit,
+                "parameter": v.parameter,
+                "probability": probability[v.mechanism],
+                "sign": v.sign,
             }
+            entries.setdefault(v.mechanism, entry)
     return tuple(sorted(entries.values(), key=lambda e: -e["probability"]))
 
 
 def likeness_of(search: Search, sets: Sequence[Sequence[str]], ranking: Sequence[Mapping[str, Any]]) -> Likeness | None:
-    """How alike the mechanisms of a ranking look, each by its best formula."""
-    if search.screen is None:
+    """How alike the mechanisms of a ranking look, each by its best formula; None where none is shared by all tests."""
+    if not search.shared:
         return None
-    value, _ = search.screen.singles()
-    wanted = [name for names in sets for name in names] + [entry["mechanism"] for entry in ranking]
-    best: dict[str, int] = {}
-    for name in dict.fromkeys(wanted):
-        ks = [k for k, c in enumerate(search.screen.candidates) if c.mechanism == name]
-        if ks:
-            best[name] = max(ks, key=lambda k: value[k])
+    screen = search.screen
+    value, mechanisms = screen.singles(), screen.candidates.mechanisms
+    wanted = dict.fromkeys([name for names in sets for name in names] + [entry["mechanism"] for entry in ranking])
+    best = {
+        name: max(np.flatnonzero(mechanisms == name), key=lambda k: value[k]) for name in wanted if name in mechanisms
+    }
     rows = np.array(list(best.values()), int)
-    score = search.screen.settings[0].score[rows]
-    sign = np.where(search.screen.signs[rows] == 0, np.where(score < 0, -1, 1), search.screen.signs[rows])
-    return Likeness(tuple(best), search.screen.similarity[np.ix_(rows, rows)] * sign * sign[:, None])
+    score, signs = screen.score[0][rows], screen.candidates.signs[rows]
+    sign = np.where(signs == 0, np.where(score < 0, -1, 1), signs)
+    return Likeness(tuple(best), screen.similarity[np.ix_(rows, rows)] * sign * sign[:, None])
 
 
-def residuals_of(search: Search, winner: Names | None) -> Residuals:
+def residuals_of(base: Base, nothing: Fitted, fitted: Fitted) -> Residuals:
     """Residuals of every test, without and with what was found, both in units of the noise of the latter."""
-    base: Base = search.base
-    nothing = search.null
-    before = residual_of(nothing.solution, nothing.design)
-    fitted = search.found[winner or ()].at
-    assert fitted is not None
-    after = residual_of(fitted.solution, fitted.design)
+    before, after = (residual_of(one.solution, one.design) for one in (nothing, fitted))
     white_before, _ = whitened(fitted.optimum.hyper, fitted.design, before)
     white_after, sd = whitened(fitted.optimum.hyper, fitted.design, after)
-    mask = np.asarray(base.tests.mask)
+    record, mask = base.tests.record, np.asarray(base.tests.mask)
+
+    def shown(x: np.ndarray) -> np.ndarray:
+        return np.where(mask, x, 0.0)
+
     return Residuals(
-        np.asarray(base.tests.record.time),
-        np.asarray(base.tests.record.kind),
-        mask,
-        np.where(mask, before, 0.0),
-        np.where(mask, after, 0.0),
-        np.where(mask, white_before, 0.0),
-        np.where(mask, white_after, 0.0),
-        np.where(mask, sd, 0.0),
-        tuple(base.selection.kept),
-    )
+        np.asarray(record.time), np.asarray(record.kind), mask, shown(before), shown(after), shown(white_before),
+        shown(white_after), shown(sd), tuple(base.selection.kept),
+    )  # fmt: skip
 
 
-def leads_of(search: Search, winner: Names) -> tuple[dict[str, Any], ...]:
-    """Second names that improve on the winner without leading it by the margin."""
-    if len(winner) != 1 or winner == UNLISTED:
-        return ()
-    alone = search.found[winner]
-    gap = max(alone.log_evidence - search.null.log_evidence, 1e-300)
+def places(base: Base, left: np.ndarray) -> tuple[Place, ...]:
+    """The map of disagreement: squared differences by kind of segment and load; a hold is one place."""
+    mask, kind = np.asarray(base.tests.mask), np.asarray(base.tests.record.kind)
+    force = np.asarray(base.tests.force)
+    load = force / np.max(np.where(mask, force, 0.0), axis=1, keepdims=True)
+    total = max(float(np.sum(left[mask] ** 2)), 1e-300)
+    bins = list(itertools.pairwise(np.linspace(0, 1, BINS + 1).tolist()))
     found = []
-    for names, pair in search.found.items():
-        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + LEAD:
-            (second,) = set(names) - set(winner)
-            share = (pair.log_evidence - alone.log_evidence) / (gap + pair.log_evidence - alone.log_evidence)
-            found.append({"mechanism": second, "share": float(share), "resembles": []})
-    return tuple(sorted(found, key=lambda lead: -lead["share"]))
+    for code, name in KINDS.items():
+        if not (mask & (kind == code)).any():
+            continue
+        for low, high in [(0.0, 1.0)] if code == HOLD else bins:
+            inside = mask & (kind == code) & (load >= low) & ((load < high) | (high >= 1))
+            if not inside.any():
+                found.append(Place(name, (low, high), float("nan"), 0, ()))
+                continue
+            each = np.sum(np.where(inside, left, 0.0) ** 2, 1)
+            particles = tuple(np.flatnonzero(each > 0.5 * each.mean()).tolist())
+            sign = int(np.sign(np.sum(left[inside])))
+            found.append(Place(name, (low, high), float(each.sum() / total), sign, particles))
+    return tuple(found)
 
 
-def checks_of(known: Mapping[str, Mechanism], sets: Sequence[tuple[str, ...]]) -> tuple[dict[str, str], ...]:
-    """For every mechanism that has rivals, what would show it by itself."""
-    rivals = dict.fromkeys(name for names in sets if len(names) > 1 for name in names)
-    return tuple({"mechanism": name, "check": known[name].check} for name in rivals if known[name].check)
-
-
-def leader_of(search: Search) -> Hypothesis:
-    """The most probable hypothesis other than nothing."""
-    return next(search.found[names] for names in search.log_posteriors() if names)
+def where(base: Base, places: Sequence[Place]) -> list[dict[str, Any]]:
+    """The places that together hold most of the disagreement, largest first."""
+    tests, mask = base.tests, np.asarray(base.tests.mask)
+    travel = np.asarray(tests.displacement) - np.asarray(base.state.point.zero)[:, None]
+    strain = travel / np.asarray(tests.effective_diameter)[:, None]
+    least, most = np.where(mask, strain, np.inf).min(1), np.where(mask, strain, -np.inf).max(1)
+    held, found = 0.0, []
+    for place in sorted((p for p in places if p.share > 0), key=lambda p: -p.share):
+        if held >= REPORTED:
+            break
+        held += place.share
+        rows = list(place.particles)
+        found.append(
+            {
+                "segment": place.segment,
+                "load_fraction": list(place.load_fraction),
+                "strain": [float(least[rows].min()), float(most[rows].max())],
+                "share": place.share,
+                "particles": [base.names[i] for i in rows],
+                "direction": f"{'more' if place.sign > 0 else 'less'} displacement than the law",
+            }
+        )
+    return found

@@ -1,10 +1,15 @@
-"""The design matrix of a hypothesis around a state, and where the state moves to."""
+"""The design matrix of a hypothesis around a state, and its whitening.
+
+Of a hypothesis's evidence only the noise's filter is compiled: for a few columns at a time, so that one program serves
+all hypotheses.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,64 +17,179 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..calibrate.compiling import compiled
-from ..calibrate.forward import Forms, Linear, Point, linearise
+from ..calibrate.data import Tests
+from ..calibrate.forward import Forms, Linear, linearise
+from ..calibrate.model import Model
+from ..calibrate.noise import Along, Correlation, Noise, whitening
 from ..calibrate.priors import nuisance_moments
 from ..effects import Variant
 from .base import Base, State
-from .columns import Design, Kinds, prior_of_noise
-from .evidence import Solution
-from .settings import POPULATION
+
+LOG_2PI = float(np.log(2 * np.pi))
+
+AT_ONCE = 6, 18  # columns that are whitened in one call, at least and at most
+ENTRIES = 270_000  # numbers that these hold together, about, so that they stay in a processor's own memory
 
 
-def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:
-    """Means of the particles' b1, b3, b5, e under the population.
+# ---- whitening -------------------------------------------------------------------------------------------------------
 
-    b1, b3, b5 of the population are those at the campaign's average shape; its mean, as a, is taken in by the prior.
-    """
-    log_eta = jnp.log1p(jnp.maximum(beta[0] * flatness, -0.99))
-    shift = jnp.mean(log_eta)
-    b = beta[2:5][None] + (log_eta - shift)[:, None]
-    e = beta[1] + power * log_eta
-    return jnp.concatenate([b, e[:, None]], 1)
+
+class White(NamedTuple):
+    """Whitened columns: their noise is independent from point to point and of variance 1."""
+
+    columns: Any
+    log_density: Any  # of the noise at 0
+    reading: Any  # sum of squares that reading a display alone brings about
+    sd: Any  # of each point given those before it
 
 
 @compiled
-def means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> tuple[Array, Array]:
-    """Means of the particles' b1, b3, b5, e, and their derivatives by the population."""
-    return particle_means(beta, flatness, power), jax.jacfwd(lambda b: particle_means(b, flatness, power))(beta)
+def white_of(
+    logs: Float[Array, " 4"],
+    scale: Array,
+    tests: Tests,
+    linear: Linear,
+    columns: Float[Array, "particles points few"],
+    correlation: Correlation,
+) -> White:
+    """Whiten columns of all tests, at the logarithms of the noise's four numbers."""
+    noise = Noise.from_logs(logs, scale)
+
+    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> White:
+        filtered = whitening(noise, scale, tests, linear, correlation, Along.LOAD)
+        constant = filtered.log_det + jnp.sum(jnp.where(tests.mask, LOG_2PI, 0.0))
+        return White(filtered(columns), -0.5 * constant, filtered.reading, filtered.solver.factor.diag.d)
+
+    return jax.vmap(one)(scale, tests, linear, columns)
 
 
-def linear_means(base: Base, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """`means_and_slope` at a state, as arrays of NumPy."""
-    at, slope = means_and_slope(state.population, jnp.asarray(base.flatness), base.model.shape_power)
-    return np.asarray(at), np.asarray(slope)
+@compiled
+def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *given: Any) -> Float[Array, " 4"]:
+    """Derivatives of a weighted sum of what `white_of` gives by the logarithms of the noise's four numbers."""
+    _, back = jax.vjp(lambda at: white_of(at, *given)[:3], logs)
+    return back(weights)[0]
+
+
+class Columns:
+    """Columns of a design, whitened in pieces of one shape; columns of zeros are left out."""
+
+    def __init__(self, columns: np.ndarray, design: Design) -> None:
+        self.shape = columns.shape
+        self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
+        least, most = AT_ONCE
+        size = min(max(ENTRIES // (self.shape[0] * self.shape[1]), least), most)
+        count = -(-max(len(self.some), 1) // size)
+        padded = np.zeros((*self.shape[:2], count * size))
+        padded[..., : len(self.some)] = columns[..., self.some]
+        self.pieces = [jnp.asarray(piece) for piece in np.split(padded, count, -1)]
+        tests = design.tests
+        if design.along is Along.TIME:  # one program for both
+            tests = replace(tests, path=tests.record.time)
+        self.arrays, self.correlation = (jnp.asarray(design.scale), tests, design.linear), design.correlation
+        self._white: tuple[bytes, White] | None = None
+        self._gram: tuple[White, np.ndarray] | None = None
+
+    def _given(self, hyper: np.ndarray, piece: Array) -> tuple[Any, ...]:
+        return jnp.asarray(hyper[:4]), *self.arrays, piece, self.correlation
+
+    def _whitened(self, hyper: np.ndarray) -> White:
+        """The columns that are not zero, padded.
+
+        Those at the hyperparameters of the last call are kept, since most are asked for more than once.
+        """
+        noise = np.asarray(hyper[:4], float).tobytes()
+        last = self._white  # another thread may put its own in place meanwhile
+        if last is not None and last[0] == noise:
+            return last[1]
+        found = [jax.tree.map(np.asarray, white_of(*self._given(hyper, piece))) for piece in self.pieces]
+        white = found[0]._replace(columns=np.concatenate([one.columns for one in found], -1))
+        self._white = noise, white
+        return white
+
+    def white(self, hyper: np.ndarray) -> White:
+        """Whitened at the hyperparameters."""
+        white, columns = self._whitened(hyper), np.zeros(self.shape)
+        columns[..., self.some] = white.columns[..., : len(self.some)]
+        return white._replace(columns=columns)
+
+    def gram(self, hyper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrix of every particle's whitened columns, the readings' squares with the data's; log density of the
+        noise at 0."""
+        white, last = self._whitened(hyper), self._gram
+        if last is not None and last[0] is white:
+            return last[1], white.log_density
+        k, gram = len(self.some), np.zeros((self.shape[0], self.shape[2], self.shape[2]))
+        gram[:, self.some[:, None], self.some] = (np.swapaxes(white.columns, 1, 2) @ white.columns)[:, :k, :k]
+        gram[:, -1, -1] += white.reading
+        self._gram = white, gram
+        return gram, white.log_density
+
+    def slope(self, hyper: np.ndarray, of_gram: np.ndarray) -> np.ndarray:
+        """Derivatives of something by the noise's numbers, from those by the Gram matrices; the noise's log density is
+        part of it."""
+        white, k = self._whitened(hyper).columns, len(self.some)
+        padded = np.zeros((self.shape[0], white.shape[-1], white.shape[-1]))
+        padded[:, :k, :k] = 2 * of_gram[:, self.some[:, None], self.some]
+        weights, ones, total = np.split(white @ padded, len(self.pieces), -1), np.ones(self.shape[0]), np.zeros(4)
+        for piece, weight in zip(self.pieces, weights, strict=True):
+            of_white = (jnp.asarray(weight), jnp.asarray(ones), jnp.asarray(of_gram[:, -1, -1] * ones))
+            total += np.asarray(slope_of(of_white, *self._given(hyper, piece)))
+            ones = 0.0 * ones  # density and readings count once
+        return total
+
+
+# ---- design ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Design:
+    """The design matrix of a hypothesis around a state, every number in units of its prior's standard deviation."""
+
+    tests: Tests
+    linear: Linear  # how noise of force moves the tests
+    own: Float[np.ndarray, "particles points o"]  # of random effects: b1, b3, b5, e (per unit), the zero, further ones
+    common: Float[np.ndarray, "particles points c"]  # of the population's five, further numbers of effects, misfits
+    amplitude: Float[np.ndarray, "particles points k"]  # of effects, per smallest plausible amplitude
+    data: Float[np.ndarray, "particles points"]  # what is explained [um]
+    scale: Float[np.ndarray, " particles"]  # each particle's own factor on the noise
+    group: np.ndarray  # which scale a common column has: 0 where it is fixed at 1, else its place among `misfits`
+    noise: Float[np.ndarray, "2 4"]  # prior of the noise's four numbers: means and sds of their logarithms
+    largest: Float[np.ndarray, " k"]  # largest scale of each amplitude's prior over the smallest, which is the unit
+    sign: Float[np.ndarray, " k"]
+    misfits: Float[np.ndarray, "g 3"]  # of the logarithm of each misfit's scale: median, sd, and the most it can be
+    spreads: tuple[Any, ...]  # priors of the spreads of b1, b3, b5, e, and of further own numbers
+    correlation: Correlation
+    along: Along
+
+    @cached_property
+    def columns(self) -> Columns:
+        """All columns, the data last."""
+        return Columns(np.concatenate([self.own, self.common, self.amplitude, self.data[..., None]], -1), self)
+
+    def with_noise(self, model: Model) -> Design:
+        """With the noise of a model."""
+        noise = _prior_of_noise(model)
+        return replace(self, noise=noise, correlation=model.correlation, along=model.along)
+
+    def with_amplitudes(self, columns: np.ndarray) -> Design:
+        """With other amplitudes, of either sign, whose priors are not used."""
+        count = columns.shape[-1]
+        return replace(self, amplitude=np.asarray(columns), sign=np.zeros(count), largest=np.ones(count))
 
 
 @dataclass(frozen=True)
 class ExtraColumns:
     """Columns of a hypothesis in addition to those of its formulas."""
 
-    own: np.ndarray | None = None  # of numbers that every test has of its own
-    own_spreads: tuple[Any, ...] = ()  # the priors of their spreads
-    amplitude: np.ndarray | None = None  # of further amplitudes in units of the smallest plausible one
+    own: tuple[np.ndarray, ...] = ()  # of random effects of every test
+    own_spreads: tuple[Any, ...] = ()  # the priors of their standard deviations
+    amplitude: tuple[np.ndarray, ...] = ()  # of amplitudes of either sign in units of the smallest plausible one
     largest: tuple[float, ...] = ()  # plausible amplitude of each in that unit
-    sign: tuple[int, ...] = ()
-    basis: np.ndarray | None = None  # of misfits
-    group: Sequence[int] = ()  # which misfit each of these columns belongs to, from 1 on
+    misfits: tuple[np.ndarray, ...] = ()  # of every misfit
     sizes: Sequence[tuple[float, float, float]] = ()  # of the logarithm of each one's size: median, sd, the most
-
-    def with_own(self, columns: np.ndarray, spreads: Sequence[Any]) -> ExtraColumns:
-        """Further numbers that every test has of its own, in addition."""
-        own = columns if self.own is None else np.concatenate([self.own, columns], -1)
-        return replace(self, own=own, own_spreads=(*self.own_spreads, *spreads))
 
 
 NO_EXTRA = ExtraColumns()
-
-
-def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
-    """The tests linearised at a state."""
-    return base.each(linearise, state.point, Forms(base.model.unloading, variants))
 
 
 def design_of(
@@ -80,101 +200,78 @@ def design_of(
     linear: Linear | None = None,
 ) -> Design:
     """The design of a hypothesis around a state, from the tests linearised there if they are already."""
-    tests, model, (middle, factor) = base.tests, base.model, base.population_prior
+    tests, point, (middle, factor) = base.tests, state.point, base.population_prior
     linear = linear_at(base, state, variants) if linear is None else linear
-    point, columns = state.point, np.asarray(linear.columns)
-    of_particle, effect = columns[..., :4], columns[..., 4:]
-    at, slope = linear_means(base, state)
-    population = of_particle @ (slope @ factor)
-    # The data less what the priors' means say.
-    away = at + slope @ (middle - np.asarray(state.population)) - np.asarray(point.latent)
-    data = np.asarray(linear.residual) - np.einsum("npk,nk->np", of_particle, away)
-    zero_mean, zero_sd = base.zero_prior
+    names, theta = len(variants), np.asarray(point.theta)
+    of_law, amplitude, further = np.split(np.asarray(linear.columns), [4, 4 + names], -1)
+    means, slope = particle_means(state.population, base.flatness, base.model.shape_power)
+    # The data less what the priors' means predict.
+    away = means + slope @ (middle - np.asarray(state.population)) - np.asarray(point.latent)
+    zero_prior = base.model.chosen_priors.zero_um
     ones = np.where(tests.mask, 1.0, 0.0)
-    data = data - (np.asarray(tests.contact) + zero_mean - np.asarray(point.zero))[:, None] * ones
-    own = [of_particle, (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
-    K, theta = len(variants), np.asarray(point.theta)
+    data = np.asarray(linear.residual) - np.einsum("npk,nk->np", of_law, away)
+    data = data - (np.asarray(tests.contact) + zero_prior.mean - np.asarray(point.zero))[:, None] * ones
+    data = data + np.einsum("npk,nk->np", amplitude, theta[:, :names])
+    mean, sd, positive = further_priors(variants)
+    now = theta[0, names:]
+    further = further * np.where(positive, now, 1.0)
+    for k, far in enumerate(mean - np.where(positive, np.log(np.where(positive, now, 1.0)), now)):
+        data = data - further[..., k] * far
+    common = np.concatenate([of_law @ (slope @ factor), sd * further, *more.misfits], -1)
+    fixed = common.shape[-1] - sum(columns.shape[-1] for columns in more.misfits)
+    group = [0] * fixed + [k for k, columns in enumerate(more.misfits, 1) for _ in range(columns.shape[-1])]
     units = np.array([v.plausible[0] for v in variants])
-    amplitude = [effect[..., :K] * units, *([] if more.amplitude is None else [more.amplitude])]
-    data = data + np.einsum("npk,nk->np", effect[..., :K], theta[:, :K])
-    common, place = [population], K
-    for v in variants:
-        for n in v.nuisances:
-            mean, sd = nuisance_moments(n)
-            now, column = theta[0, place], effect[..., place]
-            if n.plausible[0] > 0:
-                column, now = column * now, np.log(now)
-            data = data - column * (mean - now)
-            common.append((sd * column)[..., None])
-            place += 1
-    shared = np.concatenate([*common, *([] if more.basis is None else [more.basis])], -1)
-    largest = [*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest]
     return Design(
-        tests,
-        replace(linear, columns=linear.columns[..., :0]),  # they are part of the design: one shape for all formulas
-        np.concatenate(own, -1),
-        shared,
-        np.concatenate(amplitude, -1),
-        data,
-        base.scale,
-        np.array([0] * (shared.shape[-1] - len(more.group)) + list(more.group), int),
-        prior_of_noise(model),
-        np.array(largest, float),
-        np.array([*(v.sign for v in variants), *more.sign], float),
-        np.array(more.sizes, float).reshape(-1, 3),
-        Kinds((*base.spreads, *more.own_spreads), model.correlation, model.along),
+        tests=tests,
+        linear=replace(linear, columns=linear.columns[..., :0]),  # part of the design: one shape for all formulas
+        own=np.concatenate([of_law, (zero_prior.sd * ones)[..., None], *more.own], -1),
+        common=common,
+        amplitude=np.concatenate([amplitude * units, *more.amplitude], -1),
+        data=data,
+        scale=base.scale,
+        group=np.array(group, int),
+        noise=_prior_of_noise(base.model),
+        largest=np.array([*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest], float),
+        sign=np.array([*(v.sign for v in variants), *(0 for _ in more.largest)], float),
+        misfits=np.array(more.sizes, float).reshape(-1, 3),
+        spreads=(*base.spreads, *more.own_spreads),
+        correlation=base.model.correlation,
+        along=base.model.along,
     )
 
 
-def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
-    """The state at a solution, or on the way there: no positive number moves by more than a factor of e.
+def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
+    """The tests linearised at a state."""
+    return base.each(linearise, state.point, Forms(base.model.unloading, variants))
 
-    All numbers go the same share of the way, since an amplitude that is right at the solution is wrong with further
-    numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: the data say nothing of them.
+
+def further_priors(variants: Sequence[Variant]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Prior means and standard deviations of the formulas' further numbers, of the logarithms of those that must be
+    positive; and which must."""
+    each = [n for v in variants for n in v.nuisances]
+    mean, sd = np.array([nuisance_moments(n) for n in each]).reshape(-1, 2).T
+    return mean, sd, np.array([n.plausible[0] > 0 for n in each], bool)
+
+
+def _prior_of_noise(model: Model) -> np.ndarray:
+    prior = model.chosen_priors.noise
+    return np.stack([np.log(np.asarray(prior.median)), np.asarray(prior.log_sd)])
+
+
+@compiled
+def _means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> tuple[Array, Array]:
+    def means(beta: Array) -> Array:
+        log_eta = jnp.log1p(jnp.maximum(beta[0] * flatness, -0.99))
+        b = beta[2:5][None] + (log_eta - jnp.mean(log_eta))[:, None]
+        return jnp.concatenate([b, (beta[1] + power * log_eta)[:, None]], 1)
+
+    return means(beta), jax.jacfwd(means)(beta)
+
+
+def particle_means(population: Any, flatness: Any, power: float) -> tuple[np.ndarray, np.ndarray]:
+    """Means of the particles' b1, b3, b5, e under the population, and their derivatives by the population.
+
+    b1, b3, b5 of the population are those at the campaign's average shape; its mean, as a, is taken in by the prior.
     """
-    tests, (mean, factor) = base.tests, base.population_prior
-    beta = mean + factor @ solution.common[:POPULATION]
-    at, slope = linear_means(base, state)
-    latent = at + slope @ (beta - np.asarray(state.population)) + solution.own[:, :4]
-    zero_mean, zero_sd = base.zero_prior
-    zero = np.asarray(tests.contact) + zero_mean + zero_sd * solution.own[:, 4]
-    old, place, share = np.asarray(state.point.theta[0]), POPULATION, 1.0
-    steps = [v.plausible[0] * float(solution.amplitude[k]) - float(old[k]) for k, v in enumerate(variants)]
-    logs = [False] * len(steps)
-    for k, v in enumerate(variants):
-        for n in v.nuisances:
-            middle, sd = nuisance_moments(n)
-            x, now = middle + sd * float(solution.common[place]), float(old[len(steps)])
-            log = n.plausible[0] > 0
-            step = x - np.log(now) if log else float(np.clip(x, *n.plausible)) - now
-            step = step if old[k] else 0.0
-            if log:
-                share = min(share, 1 / max(abs(step), 1.0))
-            steps.append(step)
-            logs.append(log)
-            place += 1
-    ways = share * np.array(steps)
-    numbers = np.where(logs, old[: len(steps)] * np.exp(np.where(logs, ways, 0.0)), old[: len(steps)] + ways)
-
-    there = State(Point(jnp.asarray(latent), jnp.asarray(zero), state.point.theta), jnp.asarray(beta))
-    return between(state, there, share).with_numbers(numbers)
-
-
-def at_priors(base: Base, rows: np.ndarray) -> State:
-    """Where the base law fits, but for some tests at the priors' middle; the population, too, if they are most.
-
-    The law is monotone there, as tests are, and what it lacks can be found from there.
-    """
-    mean, point = base.population_prior[0], base.state.point
-    population = np.asarray(base.state.population)
-    if 2 * rows.sum() > len(rows):
-        population = np.concatenate([population[:2], mean[2:]])
-    middle = particle_means(jnp.asarray(mean), jnp.asarray(base.flatness), base.model.shape_power)
-    latent = jnp.where(rows[:, None], middle, point.latent)
-    zero = jnp.where(rows, base.tests.contact, point.zero)
-    return State(replace(point, latent=latent, zero=zero), jnp.asarray(population))
-
-
-def between(one: State, other: State, share: float = 0.5) -> State:
-    """A share of the way from one state to another, half of it by default."""
-    return jax.tree.map(lambda x, y: (1 - share) * x + share * y, one, other)
+    means, slope = _means_and_slope(jnp.asarray(population), jnp.asarray(flatness), power)
+    return np.asarray(means), np.asarray(slope)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from .. import arguments
 from .._errors import InputError
-from .._format import listed, plain
 from .._types import Progress
-from ..calibrate import Model, Posterior, sample
+from ..calibrate import Model, sample
 from ..calibrate.compiling import one_blas_thread
 from ..calibrate.data import root_mean_squares
 from ..calibrate.fitting import checked_settings
@@ -23,20 +24,18 @@ from ..campaign.force_zero import open_zero
 from ..effects import LIBRARY, Mechanism
 from . import answer
 from .base import Base, base_fit
-from .bootstrap import p_anything
-from .candidates import located, untestable, without_punch
 from .closure import closure
-from .experiments import next_experiments
-from .heldout import held_out
+from .design import design_of
 from .hypothesis import UNLISTED, Names
-from .locate import difference, places, where
-from .plan import without_effects
-from .result import Discovery, Effect
+from .plan import next_experiments, without_effects
+from .result import Discovery
+from .screen import located, untestable, without_punch
 from .search import Search
-from .sentences import summary_of
-from .settings import AT_PEAKS, DECISIONS
+from .sentences import summary_of, taken_back
+from .settings import AT_PEAKS
+from .verify import held_out, p_anything
 
-_Begun = tuple[Search, list[dict[str, str]], list[Finding]]
+LEAST = 3  # particles of which one can be held out
 
 
 @one_blas_thread
@@ -83,9 +82,11 @@ def discover(
     campaign = check_tests(campaign)
     progress, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
-    for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
-        arguments.flag(value, name)
-    known = _searched(library, exclude)
+    known = dict(LIBRARY if library is None else library)
+    for name in exclude:
+        if name not in known:
+            raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
+        known.pop(name)
     findings = campaign_findings(campaign)
     wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "error"]
     if wrong:
@@ -93,13 +94,18 @@ def discover(
         found = Discovery("FIT_NOT_CONVERGED", summary, None, None, seed, 0.0)
         return _finished(found, (*wrong, *findings), started)
     begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, progress=progress)
-    search, missing, left_out = begun(campaign, findings)
-    p_any = _run(search, seed, progress)
-    if _is_gap(search, p_any):
-        explained = _not_tared(campaign, search, begun, seed, progress)
-        search, p_any, missing, left_out = explained or (search, p_any, missing, left_out)
-    base, findings = search.base, (*findings, *left_out)
+    search = begun(campaign, findings)
+    _run(search, seed)
+    if search.is_gap:
+        search = _not_tared(campaign, search, begun, seed) or search
+    base, findings = search.base, (*findings, *search.left_out)
     ranking = answer.ranking_of(search)
+    # By the law alone, under the model's own noise: those of a calibration.
+    alone = answer.population_under(base, None, base.hyperparameters, design_of(base, base.state))
+    why_not = zip(base.campaign.particles, base.selection.why_not, strict=True)
+    notes = [*base.selection.notes, *(f"particle {name!r} {why}" for name, why in why_not if why is not None)]
+    if len(base.tests) < LEAST:
+        notes.append("of fewer than three particles none can be held out: what is found rests on the noise model alone")
     found = Discovery(
         "NO_GAP",
         "",
@@ -108,24 +114,25 @@ def discover(
         seed,
         0.0,
         ranking=ranking,
-        untestable=tuple(missing),
-        p_any=p_any,
-        parameters_before=answer.parameters_alone(base),
-        notes=_notes(base),
+        untestable=tuple(search.untestable),
+        p_any=search.p_any,
+        parameters_before=answer.averaged([alone], np.ones(1), len(base.tests)),
+        notes=tuple(notes),
         likeness=answer.likeness_of(search, (), ranking),
     )
-    if not _is_gap(search, p_any):
+    if not search.is_gap:
         return _finished(_of_law_alone(found, search), findings, started)
-    winner = answer.leader_of(search).names
-    if confirm and base.holds_out:
+    winner = next(names for names in search.log_posteriors() if names)
+    if confirm and len(base.tests) >= LEAST:
         progress("held-out particles")
         held = held_out(search, winner)
         found = replace(found, held_out=held)
-        assert held.residual_um is not None
         objection = held.objection([root_mean_squares(base.tests, one) for one in held.residual_um], base.range_um)
         if objection is not None:
-            return _finished(_taken_back(_of_law_alone(found, search), winner, objection), findings, started)
-    found = _named(found, search, known, progress)
+            summary = taken_back(() if winner == UNLISTED else winner, objection)
+            found = replace(_of_law_alone(found, search), verdict="FIT_NOT_CONVERGED", summary=summary)
+            return _finished(found, findings, started)
+    found = _named(found, search, winner, known)
     separate = [e.mechanism for e in found.effects if located(e.variant)]
     if separate:
         note = (
@@ -134,25 +141,13 @@ def discover(
         )
         found = replace(found, notes=(*found.notes, note))
     elif posterior and found.effects:
-        found = _sampled(found, search, threshold_MPa, seed, progress)
-    if experiments and found.candidate_set and len(found.candidate_set) == 1:
+        found = _sampled(found, search, winner, threshold_MPa)
+    if experiments and len(found.candidate_set) == 1:
         progress("next experiments")
-        alone = tuple(n for n in found.candidate_set[0] if n not in found.paired)
+        paired = {name for pair in found.pairs for name in pair}
+        alone = tuple(n for n in found.candidate_set[0] if n not in paired)
         found = replace(found, next_experiments=tuple(next_experiments(search, alone)))
     return _finished(found, findings, started)
-
-
-def _searched(library: Mapping[str, Mechanism] | None, exclude: Sequence[str]) -> dict[str, Mechanism]:
-    """The mechanisms to look for."""
-    if isinstance(exclude, str) or not isinstance(exclude, Iterable):
-        remedy = f"Write exclude=({exclude!r},)." if isinstance(exclude, str) else None
-        raise InputError(f"exclude must be a list of names, got {arguments.kind_of(exclude)}", remedy=remedy)
-    known = dict(LIBRARY if library is None else library)
-    for name in exclude:
-        if name not in known:
-            raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
-        known.pop(name)
-    return known
 
 
 def _begun(
@@ -163,8 +158,8 @@ def _begun(
     known: Mapping[str, Mechanism],
     threshold_MPa: float,
     progress: Progress,
-) -> _Begun:
-    """The search with the law alone in it, what these tests cannot say, and what was left out."""
+) -> Search:
+    """The search with the law alone in it."""
     base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, progress)
     known = without_punch(known, base)
     testable, missing = untestable(known, available_data(campaign))
@@ -172,49 +167,9 @@ def _begun(
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     progress("signatures of all effects")
     with numbers_in_reach(base.campaign):
-        return Search(base, testable, progress, whole=known), missing, left_out
-
-
-def _run(search: Search, seed: int, progress: Progress) -> float:
-    """Work all hypotheses out; how likely so much evidence of anything is by chance."""
-    with numbers_in_reach(search.base.campaign):
-        search.run()
-        progress("is anything missing")
-        return p_anything(search, seed)
-
-
-def _is_gap(search: Search, p_any: float) -> bool:
-    """Whether anything is missing."""
-    return p_any < DECISIONS.level and search.posterior()[()] < 0.5
-
-
-def _not_tared(
-    campaign: Campaign, search: Search, begun: Callable[..., _Begun], seed: int, progress: Progress
-) -> tuple[Search, float, list[dict[str, str]], list[Finding]] | None:
-    """The search with what the tests begin at taken off their force, where the law alone then does; None elsewhere.
-
-    Its evidence must be larger than that of anything named with the zero of the file, and nothing may be missing there.
-    """
-    zero = open_zero(campaign)
-    if zero is None:
-        return None
-    progress("the same, had the load cell not been tared")
-    assert campaign.raw is not None
-    tared = check_tests(campaign.raw, zero_mN=zero)
-    other, missing, left_out = begun(tared, campaign_findings(tared))
-    best = max(one.log_evidence for one in search.found.values())
-    # Readings without force are not compared, so evidence counts by the reading.
-    if other.null.log_evidence / other.base.readings <= best / search.base.readings:
-        return None
-    p_any = _run(other, seed, progress)
-    if _is_gap(other, p_any):
-        return None
-    text = (
-        f"With the zero of the file, law and tests disagree; with {zero[0]:.3g} mN taken off every force they do not: "
-        "a load cell that was not tared is explanation enough, and nothing is named"
-    )
-    remedy = "Take a record that begins in the air; if the particles were preloaded, something is missing after all"
-    return other, p_any, missing, [Finding("zero of force", "warning", text, remedy), *left_out]
+        search = Search(base, testable, progress, whole=known)
+    search.untestable, search.left_out = missing, left_out
+    return search
 
 
 def _settled_fit(
@@ -232,8 +187,8 @@ def _settled_fit(
         left_out.append(Finding("left out", "warning", text, "", unsafe))
         campaign = campaign.without(*unsafe)
     base = base_fit(campaign, model, threshold_MPa=threshold_MPa, progress=progress)
-    outlying, snapping = unlike_others(base.names, base.rms_um, base.range_um), base.snapping
-    without: tuple[str, ...] = ()
+    outlying, without = unlike_others(base.names, base.rms_um, base.range_um), ()
+    snapping = tuple(name for name, low in zip(base.names, base.snaps, strict=True) if low)
     if outlying is not None:
         left_out.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
         without = outlying.particles
@@ -241,108 +196,122 @@ def _settled_fit(
     if snapping and not base.coarse and left >= LEAST_LEFT:
         text = f"{named(snapping, len(campaign))}: the law snaps through in its loading; it takes no part in the search"
         left_out.append(Finding("snap-through", "info", text, "", snapping))
-        without = (*without, *(name for name in snapping if name not in without))
+        without = tuple(dict.fromkeys((*without, *snapping)))
     if without:
         base = base_fit(campaign.without(*without), model, threshold_MPa=threshold_MPa, progress=progress)
     return base, left_out
 
 
-def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], progress: Progress) -> Discovery:
-    """The answer with the leading hypothesis: effects or a formula, where, and what it did to the parameters."""
-    leader = answer.leader_of(search)
-    winner: Names = leader.names
-    left = answer.residuals_of(search, winner)
-    map_ = places(search.base, difference(left.before, left.after, left.used))
-    found = replace(
-        found,
-        residuals=left,
-        places=map_,
-        where=tuple(where(search.base, map_)),
-        parameters_after=answer.parameters_with(search, answer.likely(search)),
-        leads=answer.leads_of(search, winner),
+def _run(search: Search, seed: int) -> None:
+    """Work all hypotheses out; how likely so much evidence of anything is by chance."""
+    with numbers_in_reach(search.base.campaign):
+        search.run()
+        search.progress("is anything missing")
+        search.p_any = p_anything(search, seed)
+
+
+def _not_tared(campaign: Campaign, search: Search, begun: Callable[..., Search], seed: int) -> Search | None:
+    """The search with what the tests begin at taken off their force, where the law alone then does; None elsewhere.
+
+    Its evidence must be larger than that of anything named with the zero of the file, and nothing may be missing there.
+    """
+    zero = open_zero(campaign)
+    if zero is None:
+        return None
+    search.progress("the same, had the load cell not been tared")
+    assert campaign.raw is not None
+    tared = check_tests(campaign.raw, zero_mN=zero)
+    other = begun(tared, campaign_findings(tared))
+    best = max(one.log_evidence for one in search.found.values())
+    # Readings without force are not compared, so evidence counts by the reading.
+    readings, as_read = (int(one.base.tests.mask.sum()) for one in (other, search))
+    if other.null.log_evidence / readings <= best / as_read:
+        return None
+    _run(other, seed)
+    if other.is_gap:
+        return None
+    text = (
+        f"With the zero of the file, law and tests disagree; with {zero[0]:.3g} mN taken off every force they do not: "
+        "a load cell that was not tared is explanation enough, and nothing is named"
     )
-    if winner == UNLISTED:
-        progress("a formula of its own")
-        return replace(found, verdict="UNLISTED", closure=closure(search, found.seed))
-    effects = answer.effects_of(search, winner, answer.name_probabilities(search), found.p_any)
-    pairs = answer.instead_of(search, winner)
-    sets = answer.sets_of(search, winner, effects, pairs)
-    model = found.model
-    assert model is not None
-    model = model.with_effects(*(e.variant for e in effects if not located(e.variant)))
-    return replace(
-        found,
-        verdict="SET" if any(len(names) > 1 for names in sets) else "NAMED",
-        model=model,
-        effects=effects,
-        candidate_set=sets,
-        pairs=pairs,
-        checks=answer.checks_of(known, sets),
-        likeness=answer.likeness_of(search, sets, found.ranking),
-    )
+    remedy = "Take a record that begins in the air; if the particles were preloaded, something is missing after all"
+    other.left_out.insert(0, Finding("zero of force", "warning", text, remedy))
+    return other
 
 
 def _of_law_alone(found: Discovery, search: Search) -> Discovery:
     """The answer with what the law alone leaves, and where."""
-    left = answer.residuals_of(search, None)
-    return replace(found, residuals=left, places=places(search.base, difference(left.before, None, left.used)))
+    left = answer.residuals_of(search.base, search.null, search.null)
+    return replace(found, residuals=left, places=answer.places(search.base, left.before))
 
 
-def _taken_back(found: Discovery, winner: Names, objection: str) -> Discovery:
-    """No answer: the law misses these tests, and what would explain it does not hold on held-out particles."""
-    names = "a formula of its own" if winner == UNLISTED else listed(list(map(plain, winner)))
-    summary = (
-        f"The law does not describe these tests, and nothing was found that does. What explains most is {names}, but "
-        f"of particles that took no part {objection}. Look at the tests one by one: records that run on through slips "
-        "or breakage, particles of several kinds, or another material than the law was made for would do this; leave "
-        "out what is no test of one particle, and discover again."
+def _named(found: Discovery, search: Search, winner: Names, known: Mapping[str, Mechanism]) -> Discovery:
+    """The answer with the leading hypothesis: effects or a formula, where, and what it did to the parameters."""
+    fitted = search.found[winner].at
+    assert fitted is not None
+    left = answer.residuals_of(search.base, search.null, fitted)
+    map_ = answer.places(search.base, left.before - left.after)
+    found = replace(
+        found,
+        residuals=left,
+        places=map_,
+        where=tuple(answer.where(search.base, map_)),
+        parameters_after=answer.parameters_with(search),
+        leads=answer.leads_of(search, winner),
     )
-    return replace(found, verdict="FIT_NOT_CONVERGED", summary=summary)
+    if winner == UNLISTED:
+        search.progress("a formula of its own")
+        return replace(found, verdict="UNLISTED", closure=closure(search, found.seed))
+    effects = answer.effects_of(search, winner, found.p_any)
+    pairs = answer.instead_of(search, winner)
+    sets = answer.sets_of(search, winner, effects, pairs)
+    rivals = dict.fromkeys(name for names in sets if len(names) > 1 for name in names)
+    return replace(
+        found,
+        verdict="SET" if any(len(names) > 1 for names in sets) else "NAMED",
+        model=search.base.model.with_effects(*(e.variant for e in effects if not located(e.variant))),
+        effects=effects,
+        candidate_set=sets,
+        pairs=pairs,
+        checks=tuple({"mechanism": name, "check": known[name].check} for name in rivals if known[name].check),
+        likeness=answer.likeness_of(search, sets, found.ranking),
+    )
 
 
-def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, progress: Progress) -> Discovery:
+def _sampled(found: Discovery, search: Search, winner: Names, threshold_MPa: float) -> Discovery:
     """The answer with the posterior of the law with effects, if it may be believed."""
-    progress("posterior of the law with effects")
-    base, fitted = search.base, answer.leader_of(search).at
+    search.progress("posterior of the law with effects")
+    base, fitted = search.base, search.found[winner].at
     same = fitted is not None and found.model is not None and fitted.variants == found.model.effects
-    drawn: Posterior = sample(
+    drawn = sample(
         base.campaign,
         found.model,
         threshold_MPa=threshold_MPa,
-        seed=seed,
+        seed=found.seed,
         without_flagged=False,
         start=fitted.start(base) if fitted is not None and same else None,
-        progress=progress,
+        progress=search.progress,
     )
+    found = replace(found, posterior=drawn)
     if drawn.failures():
         note = (
             f"the posterior of the law with effects has not converged ({'; '.join(drawn.failures())}); amplitudes and "
             "parameters are those of the linear model at its optimum"
         )
-        return replace(found, posterior=drawn, notes=(*found.notes, note))
-    parameters: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
-    linear = found.parameters_after
-    same = linear[AT_PEAKS]["value"] == linear["effective_modulus_MPa"]["value"]
-    parameters[AT_PEAKS] = parameters["effective_modulus_MPa"] if same else linear[AT_PEAKS]
-    effects: tuple[Effect, ...] = tuple(answer.with_draws(effect, drawn) for effect in found.effects)
-    if found.verdict == "SET" or any(effect.misfit for effect in effects):
+        return replace(found, notes=(*found.notes, note))
+    found = replace(found, effects=tuple(answer.with_draws(effect, drawn) for effect in found.effects))
+    if found.verdict == "SET" or any(effect.misfit for effect in found.effects):
         # The draws take the leading formula for true: their errors would be too small.
         note = (
             "parameters and their errors allow for what else may be missing and for how far the formula is off; the "
             "posterior's draws take the formula unchanged"
         )
-        return replace(found, posterior=drawn, effects=effects, notes=(*found.notes, note))
-    return replace(found, posterior=drawn, effects=effects, parameters_after=parameters)
-
-
-def _notes(base: Base) -> tuple[str, ...]:
-    notes = list(base.selection.notes)
-    for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
-        if reason is not None:
-            notes.append(f"particle {name!r} {reason}")
-    if not base.holds_out:
-        notes.append("of fewer than three particles none can be held out: what is found rests on the noise model alone")
-    return tuple(notes)
+        return replace(found, notes=(*found.notes, note))
+    parameters: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
+    linear = found.parameters_after
+    same = linear[AT_PEAKS]["value"] == linear["effective_modulus_MPa"]["value"]
+    parameters[AT_PEAKS] = parameters["effective_modulus_MPa"] if same else linear[AT_PEAKS]
+    return replace(found, parameters_after=parameters)
 
 
 def _finished(found: Discovery, findings: Sequence[Finding], started: float) -> Discovery:

@@ -4,11 +4,12 @@ Around the state every test i is
 
 .. math:: y_i = J_i T v_i + \zeta_i + V_i S w_i + M_i \epsilon + B_i R g + A_i \theta + \text{noise}
 
-with the particle's own deviations v, zero and further numbers w, what all particles share: population, further numbers
-of the effects and weights of a misfit (epsilon, g), and the amplitudes theta. All but the amplitudes are standard
+with the particle's own deviations v, zero and random effects w, what all particles share (population, further numbers
+of the effects and weights of a misfit: epsilon, g), and the amplitudes theta. All but the amplitudes are standard
 normal, once their scales T, S, R are taken into the columns. They are integrated out in closed form, particles first;
 an amplitude's prior is a mixture of half-normals, whose integral is closed, too. Scales and noise are at their
-posterior mode, and their curvature is integrated by Laplace's method.
+posterior mode, and their curvature is integrated by Laplace's method. Together these hyperparameters are `hyper`:
+logarithms of the noise's four numbers, coordinates of the spreads, and logarithms of the misfits' scales.
 """
 
 from __future__ import annotations
@@ -23,13 +24,17 @@ from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from ..calibrate.priors import SCALES, SpreadCoordinate
-from .columns import LOG_2PI, Columns, Design, with_amplitudes
+from .design import LOG_2PI, Columns, Design
 from .settings import LENGTH_FACTORS, NOISE_FACTORS, STRONG
 
 LITTLE = 0.1  # factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted
 FLAT = 0.2  # slope at which a mode is reached, per expected standard deviation: 0.02 nats away
 ITERATIONS = 40  # of L-BFGS at most
+ALL = slice(None)  # particles
 ASIDE = 0.1  # how far from the mode slopes are compared for its curvature, in expected standard deviations
+
+
+ValueAndSlope = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
 class Spreads(NamedTuple):
@@ -59,15 +64,16 @@ def spreads_of(x: np.ndarray, priors: tuple[Any, ...]) -> Spreads:
     return Spreads(value, slope, log_prob, np.tanh(x) - value / sd**2 * slope)
 
 
-def scales_of(hyper: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
-    """Scales of the own columns and of the common ones, at the hyperparameters.
+def _parts(hyper: np.ndarray, design: Design) -> list[np.ndarray]:
+    """The hyperparameters of the noise, of the spreads, and of the misfits."""
+    return np.split(hyper, [4, 4 + len(design.spreads)])
 
-    They are logarithms of the noise's four numbers, the spreads' coordinates, and logarithms of the misfits' scales.
-    """
-    spreads = design.kinds.spreads
-    tau = spreads_of(hyper[4 : 4 + len(spreads)], spreads).value
-    misfit = np.append(1.0, np.exp(hyper[4 + len(spreads) :]))
-    return np.concatenate([tau[:4], [1.0], tau[4:]]), misfit[design.group]
+
+def scales_of(hyper: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
+    """Scales of the own columns and of the common ones."""
+    _, spreads, misfits = _parts(hyper, design)
+    own = np.insert(spreads_of(spreads, design.spreads).value, 4, 1.0)  # the zero's is in its column
+    return own, np.append(1.0, np.exp(misfits))[design.group]
 
 
 def _scaled(form: np.ndarray, factor: np.ndarray) -> np.ndarray:
@@ -109,9 +115,7 @@ class Marginalised(NamedTuple):
         half = np.linalg.solve(self.root, np.broadcast_to(eye, self.root.shape))
         inner = cross @ np.swapaxes(down, -1, -2) - 0.5 * np.swapaxes(half, -1, -2) @ half
         outer = np.broadcast_to(of_schur, (*inner.shape[:-2], *of_schur.shape[-2:]))
-        return np.concatenate(
-            [np.concatenate([inner, cross], -1), np.concatenate([np.swapaxes(cross, -1, -2), outer], -1)], -2
-        )
+        return np.block([[inner, cross], [np.swapaxes(cross, -1, -2), outer]])
 
 
 def marginalise(gram: np.ndarray, count: int) -> Marginalised:
@@ -169,15 +173,13 @@ def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Ampli
 
 def log_prior(hyper: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
     """Log prior of the hyperparameters, and its derivatives; of a spread's coordinate of either sign together."""
-    count = 4 + len(design.kinds.spreads)
-    spreads = spreads_of(hyper[4:count], design.kinds.spreads)
-    means = np.concatenate([design.noise[0], design.misfits[:, 0]])
-    sds = np.concatenate([design.noise[1], design.misfits[:, 1]])
-    z = (np.concatenate([hyper[:4], hyper[count:]]) - means) / sds
+    noise, at, misfits = _parts(hyper, design)
+    spreads = spreads_of(at, design.spreads)
+    means, sds = np.concatenate([design.noise, design.misfits[:, :2].T], 1)
+    z = (np.append(noise, misfits) - means) / sds
     normal, slope = -0.5 * z**2 - np.log(sds) - 0.5 * LOG_2PI, -z / sds
-    each = np.concatenate([normal[:4], spreads.log_prob, normal[4:]])
-    slopes = np.concatenate([slope[:4], spreads.log_prob_slope, slope[4:]])
-    return float(np.sum(each)), slopes
+    total = np.sum(np.concatenate([normal[:4], spreads.log_prob, normal[4:]]))
+    return float(total), np.concatenate([slope[:4], spreads.log_prob_slope, slope[4:]])
 
 
 def _of_shared(gram: np.ndarray, design: Design) -> tuple[float, float, np.ndarray]:
@@ -190,49 +192,21 @@ def _of_shared(gram: np.ndarray, design: Design) -> tuple[float, float, np.ndarr
 def value_and_gradient(hyper: np.ndarray, design: Design, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
     """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives.
 
-    Those by the noise's four numbers cost more than all others; without `of_noise` they lack the likelihood's part.
+    Those by the noise cost more than all others; without `of_noise` they lack the likelihood's part.
     """
-    spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
+    o, c = design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
         model = LinearModel(hyper, design)
         common, effects, of_schur = _of_shared(model.particles.schur.sum(0), design)
         prior, slope = log_prior(hyper, design)
-        value = float(model.log_integral.sum() + common) + effects + prior
         of_gram = model.particles.slope(of_schur)
-        if of_noise:
-            slope[:4] += design.columns.slope(hyper, _scaled(of_gram, model.factor))
+        by_noise = design.columns.slope(hyper, _scaled(of_gram, model.factor)) if of_noise else np.zeros(4)
         of_log = 2 * np.sum(of_gram * model.gram, (0, 2))  # derivatives by the logarithms of the columns' scales
-        spread = spreads_of(hyper[4 : 4 + len(spreads)], spreads)
-        own = np.delete(of_log[:o], 4)
-        slope[4 : 4 + len(spreads)] += own * spread.slope / np.maximum(spread.value, 1e-300)
-        slope[4 + len(spreads) :] += np.bincount(design.group, of_log[o : o + c], len(design.misfits) + 1)[1:]
-    return value, slope
-
-
-class OfMisfits:
-    """The log joint density as a function of the misfits' scales alone: at fixed noise and spreads it costs nothing."""
-
-    def __init__(self, hyper: np.ndarray, design: Design) -> None:
-        o = design.own.shape[-1]
-        self.design, self.fixed = design, hyper[: 4 + len(design.kinds.spreads)]
-        gram, log_density = design.columns.gram(hyper)
-        factor = np.concatenate([scales_of(hyper, design)[0], np.ones(len(gram[0]) - o)])
-        by_particle = marginalise(_scaled(gram, factor), o)
-        self.gram, self.integrals = by_particle.schur.sum(0), float((by_particle.log_integral + log_density).sum())
-
-    def __call__(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and derivatives at the logarithms of the scales."""
-        design, c = self.design, self.design.common.shape[-1]
-        hyper = np.concatenate([self.fixed, logs])
-        factor = np.ones(len(self.gram))
-        factor[:c] = scales_of(hyper, design)[1]
-        with np.errstate(all="ignore"):
-            gram = _scaled(self.gram, factor)
-            common, effects, of_gram = _of_shared(gram, design)
-            prior, slope = log_prior(hyper, design)
-            of_log = 2 * np.sum(of_gram * gram, 0)[:c]
-        value = self.integrals + float(common) + effects + prior
-        return value, slope[len(self.fixed) :] + np.bincount(design.group, of_log, len(logs) + 1)[1:]
+        spreads = spreads_of(_parts(hyper, design)[1], design.spreads)
+        by_spreads = np.delete(of_log[:o], 4) * spreads.slope / np.maximum(spreads.value, 1e-300)
+        by_misfits = np.bincount(design.group, of_log[o : o + c], len(design.misfits) + 1)[1:]
+        value = float(model.log_integral.sum() + common) + effects + prior
+    return value, slope + np.concatenate([by_noise, by_spreads, by_misfits])
 
 
 class Solution(NamedTuple):
@@ -242,9 +216,6 @@ class Solution(NamedTuple):
     common: Float[np.ndarray, " c"]
     amplitude: Float[np.ndarray, " k"]
     sd: Float[np.ndarray, " k"]  # of the amplitudes
-
-
-EVERY = slice(None)
 
 
 class LinearModel:
@@ -258,24 +229,21 @@ class LinearModel:
         self.particles = marginalise(self.gram, design.own.shape[-1])
         self.log_integral = self.particles.log_integral + log_density
 
-    def shared(self, rows: Any = EVERY) -> Marginalised:
+    def shared(self, rows: Any = ALL) -> Marginalised:
         """What some particles say of the amplitudes, once what all particles share is integrated out, too."""
         return marginalise(self.particles.schur[rows].sum(0), self.design.common.shape[-1])
 
-    def log_evidence(self, rows: Any = EVERY) -> float:
+    def log_evidence(self, rows: Any = ALL) -> float:
         """Log marginal likelihood of some particles."""
         shared = self.shared(rows)
         effects = amplitudes(shared.schur, self.design.sign, self.design.largest)
         return float(self.log_integral[rows].sum() + shared.log_integral) + effects.log_integral
 
-    def numbers(self, rows: Any = EVERY) -> tuple[np.ndarray, np.ndarray]:
-        """Means of the scaled common numbers and of the amplitudes by some particles, and the amplitudes' errors.
-
-        An amplitude of a forbidden sign is zero.
-        """
+    def numbers(self, rows: Any = ALL) -> tuple[np.ndarray, np.ndarray]:
+        """Means of the scaled common numbers and of the amplitudes by some particles, and the amplitudes' errors."""
         shared = self.shared(rows)
         found = amplitudes(shared.schur, self.design.sign, self.design.largest)
-        theta = np.where(self.design.sign * found.mean < 0, 0.0, found.mean)
+        theta = np.where(self.design.sign * found.mean < 0, 0.0, found.mean)  # none of a forbidden sign
         return np.concatenate([np.append(-theta, 1.0) @ shared.weights, theta]), found.sd
 
     def solve(self) -> Solution:
@@ -310,14 +278,13 @@ class Optimum:
     hyper: np.ndarray
     log_evidence: float  # log marginal likelihood, the hyperparameters integrated out by Laplace's method
     log_joint: float  # at the mode
-    evaluations: int  # of the density
 
 
 class _Surface:
     """Minus the log posterior of a design's hyperparameters, in coordinates scaled by their expected curvature."""
 
     def __init__(self, design: Design) -> None:
-        count, spreads = float(np.asarray(design.tests.mask).sum()), len(design.kinds.spreads)
+        count, spreads = float(np.asarray(design.tests.mask).sum()), len(design.spreads)
         self.design, self.first = design, 4 + spreads  # hyperparameters that are no scales of misfits
         noise = count * np.array([1.5, 0.2, 0.1, 0.02])
         expected = [noise, np.full(spreads, 2.0 * len(design.tests)), np.full(len(design.misfits), 2.0)]
@@ -325,13 +292,13 @@ class _Surface:
         self.most = np.concatenate([np.full(self.first, np.inf), design.misfits[:, 2]]) / self.scale
         self.options: Any = {"ftol": 1e-7, "gtol": FLAT, "maxiter": ITERATIONS}
 
-    def _minimise(self, function: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, **more: Any):
+    def _minimise(self, function: ValueAndSlope, start: np.ndarray, **more: Any) -> Any:
         from scipy.optimize import minimize
 
         return minimize(function, start, jac=True, method="L-BFGS-B", options=self.options, **more)
 
     def _negative(self, value: float, slope: np.ndarray) -> tuple[float, np.ndarray]:
-        """Minus value and slope; a step into numbers beyond arithmetic is taken back."""
+        """Minus value and slope; a step beyond arithmetic is taken back."""
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return 1e30, np.zeros(len(slope))
         return -value, -slope * self.scale[len(self.scale) - len(slope) :]
@@ -340,10 +307,27 @@ class _Surface:
         """Value and slope, as of `value_and_gradient`."""
         return self._negative(*value_and_gradient(x * self.scale, self.design, of_noise=of_noise))
 
-    def of_misfits(self, x: np.ndarray) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-        """Value and slope as a function of the scales of misfits alone."""
-        some = OfMisfits(x * self.scale, self.design)
-        return lambda y: self._negative(*some(y * self.scale[self.first :]))
+    def of_misfits(self, x: np.ndarray) -> ValueAndSlope:
+        """Value and slope as a function of the scales of misfits alone: at fixed noise and spreads it costs nothing."""
+        design, hyper = self.design, x * self.scale
+        o, c = design.own.shape[-1], design.common.shape[-1]
+        whole, log_density = design.columns.gram(hyper)
+        own, _ = scales_of(hyper, design)
+        particles = marginalise(_scaled(whole, np.append(own, np.ones(whole.shape[-1] - o))), o)
+        integral, form = float((particles.log_integral + log_density).sum()), particles.schur.sum(0)
+
+        def at(y: np.ndarray) -> tuple[float, np.ndarray]:
+            hyper = np.append(x[: self.first], y) * self.scale
+            scales = np.append(scales_of(hyper, design)[1], np.ones(len(form) - c))
+            with np.errstate(all="ignore"):
+                gram = _scaled(form, scales)
+                common, effects, of_gram = _of_shared(gram, design)
+                prior, slope = log_prior(hyper, design)
+                of_log = 2 * np.sum(of_gram * gram, 0)[:c]
+            of_scales = np.bincount(design.group, of_log, len(y) + 1)[1:]
+            return self._negative(integral + float(common) + effects + prior, slope[self.first :] + of_scales)
+
+        return at
 
     def followed(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Where the scales of misfits are at their mode, all else as it is: the value there, and all coordinates."""
@@ -352,18 +336,16 @@ class _Surface:
         return float(found.fun), np.append(x[: self.first], found.x)
 
     def likely(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The best of several settings of correlated noise, if it is clearly better than the one given.
-
-        What was fitted without misfits may have swallowed what they explain.
-        """
+        """The best of several settings of correlated noise, if it is clearly better than the one given: what was fitted
+        without misfits may have swallowed what they explain."""
         shorter = LENGTH_FACTORS[-1]
         factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NOISE_FACTORS[1:])])
         some = [self.followed(np.concatenate([x[:2], x[2:4] + by / self.scale[2:4], x[4:]])) for by in factors]
         best = min(some, key=lambda one: one[0])
         return best if best[0] < some[0][0] - STRONG else some[0]
 
-    def mode(self, start: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, int]:
-        """The lowest point met by L-BFGS: value, coordinates, slope, and evaluations."""
+    def mode(self, start: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """The lowest point met by L-BFGS: value, coordinates and slope."""
         x = start.copy()
         least: list[Any] = [1e30, x.copy(), np.zeros(len(x))]
 
@@ -377,14 +359,13 @@ class _Surface:
                 least[:] = value, x.copy(), slope
             return value, slope[: self.first]
 
-        found = self._minimise(down, x[: self.first].copy())
-        return *least, int(found.nfev)
+        self._minimise(down, x[: self.first].copy())
+        value, at, slope = least
+        return value, at, slope
 
     def log_volume(self, x: np.ndarray, jac: np.ndarray, known: int) -> float:
-        """What Laplace's method adds for the hyperparameters at their mode, where the slope is `jac`.
-
-        The first `known` ones are integrated elsewhere.
-        """
+        """What Laplace's method adds for the hyperparameters at their mode, where the slope is `jac`, but for the first
+        `known` ones."""
         scale, first = self.scale, self.first
         bound = x * scale >= self.most * scale - 1e-6
         volume = -float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
@@ -407,10 +388,7 @@ class _Surface:
 
 
 def likely_start(design: Design, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where to look for the mode of a hypothesis with misfits, and the log posterior there.
-
-    That is as given, or with correlated noise that is clearly likelier together with the misfits.
-    """
+    """Where to look for the mode of a hypothesis with misfits, see `_Surface.likely`, and the log posterior there."""
     surface = _Surface(design)
     value, x = surface.likely(np.minimum(start / surface.scale, surface.most))
     return x * surface.scale, -value
@@ -419,17 +397,12 @@ def likely_start(design: Design, start: np.ndarray) -> tuple[np.ndarray, float]:
 def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
-    Args:
-        design: of a hypothesis.
-        start: hyperparameters to begin with.
-        curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
-        without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
-
-    Raises:
-        FloatingPointError: if it has no evidence where it begins.
+    Without `curvature` they are not integrated out: `log_evidence` is the log posterior at the mode. The curvature of
+    an optimum `without` misfits is taken for that of the hyperparameters it has. Raises FloatingPointError where there
+    is no evidence at the start.
     """
     surface = _Surface(design)
-    value, x, jac, evaluations = surface.mode(np.minimum(start / surface.scale, surface.most))
+    value, x, jac = surface.mode(np.minimum(start / surface.scale, surface.most))
     evidence = joint = -float(value)
     if joint < -1e29:
         raise FloatingPointError("the evidence of a hypothesis is no number")
@@ -437,12 +410,12 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         known = 0 if without is None else len(without.hyper)
         evidence += surface.log_volume(x, jac, known)
         evidence += 0.0 if without is None else without.log_evidence - without.log_joint
-    return Optimum(x * surface.scale, float(evidence), joint, evaluations)
+    return Optimum(x * surface.scale, float(evidence), joint)
 
 
 def visible(hyper: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:
     """What the particles' own numbers and the population leave of each curve [um], as a share, in units of noise."""
-    model = LinearModel(hyper, with_amplitudes(design, curves))
+    model = LinearModel(hyper, design.with_amplitudes(curves))
     whole = np.diagonal(model.gram.sum(0))[-1 - curves.shape[-1] : -1]
     return np.sqrt(np.clip(np.diagonal(model.shared().information) / np.maximum(whole, 1e-300), 0.0, 1.0))
 

@@ -1,22 +1,28 @@
-"""Hypotheses at their own optimum: Gauss-Newton in all numbers, hyperparameters at their mode at every step."""
+"""Hypotheses at their own optimum, by Gauss-Newton in all numbers; and the kind of noise that the tests prefer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..calibrate.data import ranges_um
 from ..calibrate.fitting import Start
-from ..calibrate.noise import Noise
+from ..calibrate.forward import Point
+from ..calibrate.judgement import LARGE_MISFIT
+from ..calibrate.model import Model
+from ..calibrate.noise import Along, Correlation, Noise, particle_scales
 from ..calibrate.population import Population
 from ..effects import Variant
 from .base import Base, State
-from .columns import Design
-from .design import NO_EXTRA, ExtraColumns, between, design_of, moved
-from .evidence import LinearModel, Optimum, Solution, optimise, spreads_of
-from .settings import EARLY
+from .design import NO_EXTRA, Design, ExtraColumns, design_of, further_priors, particle_means
+from .evidence import LinearModel, Optimum, Solution, optimise, residual_of, spreads_of, whitened
+from .settings import EARLY, POPULATION, STRONG
 
 STEPS = 25  # of Gauss-Newton at most
 STILL = 0.05  # change of the log posterior at which they end, and by which later ones may make it worse [nats]
@@ -72,20 +78,15 @@ def fit_hypothesis(
     base: Base,
     state: State,
     variants: tuple[Variant, ...],
-    numbers: np.ndarray,
+    numbers: Sequence[float] | np.ndarray,
     hyper: np.ndarray,
     more: ExtraColumns = NO_EXTRA,
 ) -> Fitted:
-    """The optimum of a hypothesis, from a state of the base law on.
+    """The optimum of a hypothesis, hyperparameters at their mode at every step.
 
-    Args:
-        base, state: tests and priors; where particles are.
-        variants: the formulas.
-        numbers: where the effects' numbers are linearised first: amplitudes of zero and further numbers.
-        hyper: hyperparameters to start from.
-        more: columns in addition to those of the formulas.
+    It begins at a state of the base law and at `numbers` of the effects: amplitudes of zero and further numbers.
     """
-    state, value = state.with_numbers(numbers), -np.inf
+    state, value = state.with_numbers(np.asarray(numbers)), -np.inf
     before = state
     design = design_of(base, state, variants, more)
     for k in range(STEPS):
@@ -98,14 +99,10 @@ def fit_hypothesis(
         last = k == STEPS - 1
         # First order from an amplitude of zero promises too much: the first steps may take some of it back. Later a
         # step that makes things worse goes to and fro around the optimum.
-        worse = value - (WORSE if k < EARLY else STILL)
-        if not last and (optimum is None or optimum.log_joint < worse):
-            state, value = between(before, state), -np.inf  # what was linear there is not here
+        if optimum is None or optimum.log_joint < value - (WORSE if k < EARLY else STILL):
+            # What was linear there is not here: half of the step, or none of it.
+            state, value = (before if last else between(before, state)), -np.inf
         else:
-            if optimum is None or (last and optimum.log_joint < worse):
-                state = before
-                design = design_of(base, state, variants, more)
-                break
             hyper = optimum.hyper
             if last or (k > 1 and abs(optimum.log_joint - value) < STILL):
                 break
@@ -113,3 +110,105 @@ def fit_hypothesis(
             state = moved(base, state, variants, LinearModel(hyper, design).solve())
         design = design_of(base, state, variants, more)
     return Fitted(variants, state, design, optimise(design, hyper))
+
+
+def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
+    """The state at a solution, or on the way there: no positive number moves by more than a factor of e.
+
+    All numbers go the same share of the way, since an amplitude that is right at the solution is wrong with further
+    numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: the data say nothing of them.
+    """
+    middle, factor = base.population_prior
+    beta = middle + factor @ solution.common[:POPULATION]
+    means, slope = particle_means(state.population, base.flatness, base.model.shape_power)
+    latent = means + slope @ (beta - np.asarray(state.population)) + solution.own[:, :4]
+    zero_prior = base.model.chosen_priors.zero_um
+    zero = np.asarray(base.tests.contact) + zero_prior.mean + zero_prior.sd * solution.own[:, 4]
+    old, now = np.split(np.asarray(state.point.theta[0]), [len(variants)])
+    to_amplitudes = solution.amplitude[: len(old)] * np.array([v.plausible[0] for v in variants]) - old
+    mean, sd, positive = further_priors(variants)
+    low, high = np.array([n.plausible for v in variants for n in v.nuisances], float).reshape(-1, 2).T
+    there = mean + sd * solution.common[POPULATION : POPULATION + len(now)]
+    way = np.where(positive, there - np.log(np.where(positive, now, 1.0)), np.clip(there, low, high) - now)
+    way = np.where(np.repeat(old, [len(v.nuisances) for v in variants]) != 0, way, 0.0)
+    share = 1 / max(1.0, np.max(np.abs(way[positive]), initial=0.0))
+    further = np.where(positive, now * np.exp(share * np.where(positive, way, 0.0)), now + share * way)
+    solved = State(Point(jnp.asarray(latent), jnp.asarray(zero), state.point.theta), jnp.asarray(beta))
+    return between(state, solved, share).with_numbers(np.append(old + share * to_amplitudes, further))
+
+
+def between(one: State, other: State, share: float = 0.5) -> State:
+    """A share of the way from one state to another, half of it by default."""
+    return jax.tree.map(lambda x, y: (1 - share) * x + share * y, one, other)
+
+
+def at_priors(base: Base, rows: np.ndarray) -> State:
+    """Where the base law fits, but for some tests at the priors' middle; the population, too, if they are most: there
+    the law is monotone, as tests are."""
+    mean, point = base.population_prior[0], base.state.point
+    population = np.asarray(base.state.population)
+    if 2 * rows.sum() > len(rows):
+        population = np.concatenate([population[:2], mean[2:]])
+    middle, _ = particle_means(mean, base.flatness, base.model.shape_power)
+    latent = jnp.where(rows[:, None], middle, point.latent)
+    zero = jnp.where(rows, base.tests.contact, point.zero)
+    return State(replace(point, latent=latent, zero=zero), jnp.asarray(population))
+
+
+def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
+    """The base law at its mode, under the kind of noise that the tests prefer: the model's own unless clearly not.
+
+    A search under noise that the tests do not have fits formulas to what the noise leaves.
+    """
+    design = design_of(base, base.state)
+    own = optimise(design, base.hyperparameters, curvature=False)
+    others = [(*_with_own_scales(design, own.hyper, model), model) for model in noise_models(base)]
+    best, scale, model = max(others, key=lambda one: one[0].log_joint)
+    if best.log_joint > own.log_joint + STRONG:
+        return replace(base, model=model, scale=scale), best
+    return base, own
+
+
+def _with_own_scales(design: Design, hyper: np.ndarray, model: Model) -> tuple[Optimum, np.ndarray]:
+    """As `with_other_noise`, with the particles' own factors that belong to this kind of noise, and these: under noise
+    of another kind what wanders for long makes some particles look noisier than others."""
+    alike = replace(design, scale=np.ones(len(design.scale))).with_noise(model)
+    found = with_other_noise(alike, hyper, model)
+    white, _ = whitened(found.hyper, alike, residual_of(LinearModel(found.hyper, alike).solve(), alike))
+    mask = np.asarray(design.tests.mask)
+    scale = particle_scales(alike.scale, np.sum(np.where(mask, white, 0.0) ** 2, 1), mask.sum(1) - 4)
+    if np.any(scale != 1.0):
+        found = with_other_noise(replace(design, scale=scale), found.hyper, model)
+    return found, scale
+
+
+def with_other_noise(design: Design, hyper: np.ndarray, model: Model) -> Optimum:
+    """The mode of the hyperparameters under the noise of a model, from the mode under another.
+
+    Its log density is -inf where the correlated noise is more than a misfit may be: a smooth curve of every test's own
+    describes any test, and leaves nothing for a law to explain.
+    """
+    other, start = design.with_noise(model), hyper.copy()
+    start[3] = other.noise[0, 3]  # the length's unit may be another
+    found = optimise(other, start, curvature=False)
+    share = np.median(np.exp(found.hyper[2]) * design.scale / ranges_um(design.tests))
+    return found if share < LARGE_MISFIT else replace(found, log_evidence=-np.inf, log_joint=-np.inf)
+
+
+def noise_models(base: Base) -> tuple[Model, ...]:
+    """The model with other kinds of noise, rough or smooth, along the load or in time; its length's prior keeps its
+    share of a test."""
+    tests, model, prior = base.tests, base.model, base.model.chosen_priors
+    mask = np.asarray(tests.mask)
+
+    def length(along: Along) -> float:
+        x = tests.path if along is Along.LOAD else tests.record.time
+        return max(float(np.median(np.where(mask, x, -np.inf).max(1) - np.where(mask, x, np.inf).min(1))), 1e-9)
+
+    models = []
+    for kind in product((Correlation.EXPONENTIAL, Correlation.MATERN_32), (Along.LOAD, Along.TIME)):
+        if kind != (model.correlation, model.along):
+            median = prior.noise_length.median * length(kind[1]) / length(model.along)
+            priors = replace(prior, noise_length=replace(prior.noise_length, median=median))
+            models.append(replace(model, correlation=kind[0], along=kind[1], priors=priors))
+    return tuple(models)

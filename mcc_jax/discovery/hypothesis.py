@@ -1,20 +1,36 @@
-"""What may be missing: hypotheses with their log evidence, prior odds, and the probability of each."""
+"""What may be missing: hypotheses, whose formulas may be wrong; effects that differ from test to test; and a smooth
+discrepancy that no mechanism explains."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betaln, expit, logsumexp
 
 from ..calibrate.model import Model
-from .columns import Design, with_noise
-from .fit import Fitted
-from .random_effects import RandomEffects
-from .settings import DECISIONS
+from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
+from ..effects import Variant
+from .base import Base, State
+from .design import NO_EXTRA, Columns, Design, ExtraColumns, design_of, linear_at
+from .evidence import LinearModel, likely_start, log_joint, optimise, scales_of, visible, with_little_noise
+from .fit import Fitted, fit_hypothesis, moved
+from .screen import Candidate, Candidates, single_integrals
+from .settings import DECISIONS, EARLY, HYPERPARAMETERS, VERY_STRONG
 
 Names = tuple[str, ...]
 UNLISTED: Names = ("UNLISTED",)
+
+# Priors of the spread of an amplitude over the particles, as a share of it; and of a random effect over the tests, in
+# units of the largest plausible one, open in its order of magnitude.
+SCATTER, SPREAD = NakagamiPrior(DECISIONS.scatter), NakagamiPrior(1.0, shape=0.25)
+
+FOLLOWED = 4  # times at most that the prior of a misfit follows the amplitude of its formula
+AGREE = 0.1  # difference of the logarithms of the two at which it need not
+DRIFTS = 6  # drifts of every test's own that are fitted at their own optimum
+MOST_STEPS = 3  # sudden ones of one test
 
 
 @dataclass
@@ -53,75 +69,274 @@ class Hypothesis:
         return tuple(float(x) for x in DECISIONS.misfit * np.exp(logs))
 
     def likely_form(self, *, misfit: bool = True) -> tuple[np.ndarray, Design]:
-        """Hyperparameters at their mode, and design, under the kind of noise that the tests prefer.
-
-        They are those with its `misfit`, if the tests prefer that, too; without, noise is that of the likelier form.
-        """
+        """Hyperparameters at their mode, and design, under the kind of noise that the tests prefer: with its misfit, if
+        they prefer that, too, and it is asked for."""
         assert self.at is not None
         hyper, design = self.at.optimum.hyper, self.at.design
         if misfit and self.is_off and self.misfit is not None:
             hyper, design = self.misfit
         if self.under_other_noise is not None:
             model, other = self.under_other_noise
-            hyper, design = other[: len(hyper)], with_noise(design, model)
+            hyper, design = other[: len(hyper)], design.with_noise(model)
         return hyper, design
 
 
-def log_posteriors(found: Mapping[Names, Hypothesis], count: int) -> dict[Names, float]:
-    """Log evidence and log prior of every hypothesis that may be named, best first: pairs lead by the margin.
+# ---- formulas that may be wrong --------------------------------------------------------------------------------------
 
-    `count` is the number of mechanisms that are searched for.
+
+def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, np.ndarray], np.ndarray]) -> None:
+    """The form of a hypothesis where every name's formula may be wrong by a share of the effect.
+
+    Columns of a misfit are made at the amplitude of the formula alone. Where the amplitude is another with them, so is
+    the effect of which they may be a share: their prior follows it until both agree. Otherwise a formula that explains
+    nothing by itself would lend its name to what its misfit explains. `columns_of` gives those by which a formula may
+    be wrong that adds a curve to the tests.
     """
-    return _that_may_be_named(_log_joints(found, count))
+    r = one.at
+    assert r is not None
+    names, curves, more = len(r.variants), r.curves_um, NO_EXTRA
+    misfits = [columns_of(v, curves[..., i]) for i, v in enumerate(r.variants)]
+    # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
+    seen = list(visible(r.optimum.hyper, r.design, curves))
+    if one.own is not None:
+        more = one.own.more
+        if not one.own.jumps:
+            curve = one.own.curve_um
+            misfits.append(columns_of(one.own.variant, curve))
+            alone = replace(r.design, own=r.design.own[..., :5], spreads=r.design.spreads[:4])
+            seen.extend(visible(r.optimum.hyper[:HYPERPARAMETERS], alone, curve[..., None]))
+    more = replace(
+        more,
+        own=(*more.own, curves),  # amplitudes differ from particle to particle
+        own_spreads=(*more.own_spreads, *[SCATTER] * names),
+        misfits=tuple(share * columns for share, columns in zip(seen, misfits, strict=True)),
+        sizes=[(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, np.log(DECISIONS.misfit_most))] * len(misfits),
+    )
+    design = design_of(base, r.state, r.variants, more)
+    scatter = float(SpreadCoordinate(SCATTER).coordinate(SCATTER.sd))
+    start = np.concatenate([r.optimum.hyper, [scatter] * names, design.misfits[:, 0]])
+    optimum = optimise(design, start, without=r.optimum)
+    sizes, shift = design.misfits, np.zeros(len(misfits))
+    units, alone = [v.plausible[0] for v in r.variants], np.maximum(np.abs(r.theta[:names]), 1e-300)
+    for _ in range(FOLLOWED):
+        amplitudes = np.abs(LinearModel(optimum.hyper, design).solve().amplitude[:names] * units)
+        away = -shift  # of a test's own numbers the prior stays
+        away[:names] += np.log(np.maximum(amplitudes, 1e-300) / alone)
+        if optimum.log_evidence < r.log_evidence or np.all(np.abs(away) < AGREE):
+            break
+        shift = shift + away / 2  # all of the way would overshoot
+        design = replace(design, misfits=sizes + shift[:, None] * [1.0, 0.0, 1.0])
+        start = np.concatenate([optimum.hyper[: -len(sizes)], design.misfits[:, 0]])
+        optimum = optimise(design, start, without=r.optimum)
+    one.misfit = optimum.hyper, replace(design)  # a copy, without its whitened columns
+    one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.of_choices)
 
 
-def posterior(found: Mapping[Names, Hypothesis], count: int) -> dict[Names, float]:
-    """Probability of every hypothesis, most probable first, of `count` mechanisms.
+@dataclass(frozen=True)
+class Discrepancy:
+    """A smooth discrepancy common to all particles, which no mechanism explains."""
 
-    The margin is for second names, which what a first one misses invites. Two names in place of the one that would be
-    named are no such invitation: they count by their prior odds, and make the answer a set.
+    parts: tuple[np.ndarray, ...]  # functions of each of its parts [um]
+    log_white: float  # logarithm of the standard deviation of white noise, by which they are measured
+
+    def added_to(self, base: Base, r: Fitted, at_least: float = -np.inf) -> Fitted | None:
+        """The law, or what is named, with the discrepancy in addition, at its optimum; None where it begins
+        `VERY_STRONG` below a log evidence to compare with."""
+        unit, count = float(np.log(DECISIONS.general)) + self.log_white, len(self.parts)
+        more = ExtraColumns(misfits=self.parts, sizes=[(unit, DECISIONS.general_log_sd, np.inf)] * count)
+        design = design_of(base, r.state, r.variants, more)
+        start, value = likely_start(design, np.append(r.optimum.hyper, [unit - 1.0] * count))
+        if value < at_least - VERY_STRONG:
+            return None
+        optimum = optimise(design, start, without=r.optimum)
+        at = Fitted(r.variants, r.state, design, optimum)
+        if not r.variants and optimum.log_joint > r.optimum.log_joint + VERY_STRONG:
+            # What it takes away from the law's numbers moves these as far as a name does; with a name that is done.
+            there = at
+            for _ in range(EARLY):
+                state = moved(base, there.state, r.variants, there.solution)
+                there = replace(there, state=state, design=design_of(base, state, r.variants, more))
+            optimum = optimise(there.design, optimum.hyper, without=r.optimum)
+            if optimum.log_joint > at.optimum.log_joint:
+                at = replace(there, optimum=optimum)
+        return at
+
+    def curve_um(self, at: Fitted) -> np.ndarray:
+        """What it adds to the law's displacement at every point, where it is part of a hypothesis [um]."""
+        return np.concatenate(self.parts, -1) @ at.solution.common[at.design.group > 0]
+
+
+# ---- effects that differ from test to test ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A sudden step in a test."""
+
+    particle: str
+    stress_MPa: float
+    size: float  # in the formula's unit
+    sd: float
+    probability: float  # that there is one in this test
+
+
+@dataclass(frozen=True)
+class RandomEffects:
+    """A hypothesis of random effects of every test, alone or with a formula that all tests share."""
+
+    variant: Variant
+    nuisance: dict[str, float]  # further numbers of the formula
+    log_evidence: float
+    at: Fitted  # the hypothesis at its optimum
+    more: ExtraColumns  # columns of its own numbers
+    jumps: tuple[Jump, ...] = ()  # sudden steps, if it is about these
+
+    @property
+    def curve_um(self) -> np.ndarray:
+        """What its own numbers add to every test [um]."""
+        solution, K = self.at.solution, len(self.at.variants)
+        own = np.einsum("npo,no->np", self.at.design.own[..., 5:], solution.own[:, 5:])
+        return own + self.at.design.amplitude[..., K:] @ solution.amplitude[K:]
+
+    def next_to(
+        self, base: Base, state: State, variants: tuple[Variant, ...], numbers: Sequence[float], hyper: np.ndarray
+    ) -> RandomEffects:
+        """The same numbers with a formula in addition, at its optimum."""
+        spreads = self.at.optimum.hyper[HYPERPARAMETERS : HYPERPARAMETERS + len(self.more.own_spreads)]
+        at = fit_hypothesis(base, state, variants, numbers, np.concatenate([hyper, spreads]), self.more)
+        return replace(self, at=at, log_evidence=at.log_evidence + self.of_choices)
+
+    @property
+    def of_choices(self) -> float:
+        """What having chosen a formula, its further numbers or places of steps costs in log evidence."""
+        return self.log_evidence - self.at.log_evidence
+
+
+class _Tried(NamedTuple):
+    """A random amplitude before its hyperparameters are at their mode."""
+
+    log_joint: float
+    hyper: np.ndarray
+    candidate: Candidate
+    design: Design
+    more: ExtraColumns
+
+
+def random_amplitude(base: Base, start: Fitted, candidates: Candidates) -> RandomEffects | None:
+    """An amplitude that scatters around a common one, over all formulas of a mechanism, added to the base law or to a
+    formula at its optimum; None if none does."""
+    hyper = np.append(start.optimum.hyper, 1.0)
+    linear = linear_at(base, start.state, start.variants)
+    tried = []
+    for k, c in enumerate(candidates.each):
+        if c.variant.random_per_test:
+            ratio, column = float(candidates.largest[k]), candidates.columns[..., k : k + 1]
+            more = ExtraColumns((ratio * column,), (SPREAD,), (column,), (ratio,))
+            design = design_of(base, start.state, start.variants, more, linear)
+            each = [(log_joint(x, design), x) for x in (hyper, with_little_noise(hyper))]
+            tried.append(_Tried(*max(each, key=lambda one: one[0]), c, design, more))
+    if not tried:
+        return None
+    tried.sort(key=lambda one: -one.log_joint)
+    fits = [optimise(one.design, one.hyper, curvature=False) for one in tried[:DRIFTS]]
+    logs = [*(fit.log_joint for fit in fits), *(one.log_joint for one in tried[DRIFTS:])]
+    values: dict[str, list[float]] = {}
+    for value, one in zip(logs, tried, strict=True):
+        values.setdefault(one.candidate.variant.name, []).append(value)
+    row = int(np.argmax([fit.log_joint for fit in fits]))
+    optimum, best = fits[row], tried[row]
+    if optimum.log_joint > start.optimum.log_joint:
+        # Numbers of its own may be as large as anything else: what was linear without them is not with them.
+        at = fit_hypothesis(base, start.state, start.variants, start.theta, optimum.hyper, best.more)
+    else:
+        at = replace(start, design=best.design, optimum=optimise(best.design, optimum.hyper))
+    each = [logsumexp(v) - np.log(len(v)) for v in values.values()]
+    total = float(logsumexp(each) - np.log(len(each))) + at.log_evidence - optimum.log_joint
+    return RandomEffects(best.candidate.variant, dict(best.candidate.nuisance), total, at, best.more)
+
+
+class Step(NamedTuple):
+    """A step that was found: in which test, from which point on, in which turn, and its standard error [um]."""
+
+    test: int
+    point: int
+    turn: int
+    sd: float
+
+
+def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects | None:
+    """Sudden steps in some tests, found one after the other, added to the base law or to a formula at its optimum.
+
+    A test has one with a probability that is itself unknown, uniformly; it may be at any point of its loading.
     """
-    joints = _log_joints(found, count)
-    logs = _that_may_be_named(joints)
-    leader = next(iter(logs))
-    if len(leader) == 1 and leader != UNLISTED:
-        logs |= {n: v for n, v in joints.items() if len(n) == 2 and leader[0] not in n}
-    total = float(np.logaddexp.reduce(list(logs.values())))
-    return {names: float(np.exp(v - total)) for names, v in _best_first(logs).items()}
+    mask = np.asarray(base.tests.mask)
+    loading = np.asarray(base.tests.loading) & mask
+    low, high = variant.plausible
+    unit, now, best, value = high / 3, start, None, -np.inf
+    columns, found, steps = (), list[Step](), list[Step]()
+    for turn in range(MOST_STEPS):
+        score, information = step_scores(now)
+        new, count = np.zeros((*mask.shape, 1)), len(found)
+        for i, of_loading in enumerate(loading):
+            rows = np.flatnonzero(of_loading)[1:]
+            if not len(rows):
+                continue
+            each = single_integrals(low * score[i, rows], low**2 * information[i, rows], 1, high / low)
+            if logsumexp(each) - np.log(len(rows)) > np.log((1 - DECISIONS.jump) / DECISIONS.jump):
+                j = int(rows[int(np.argmax(each))])
+                new[i, j:, 0] = np.where(mask[i, j:], unit, 0.0)
+                found.append(Step(i, j, turn, float(max(information[i, j], 1e-300) ** -0.5)))
+        if len(found) == count:
+            break
+        columns = (*columns, new)
+        more = ExtraColumns(columns, (SPREAD,) * (turn + 1))
+        design = design_of(base, start.state, start.variants, more)
+        optimum = optimise(design, np.concatenate([start.optimum.hyper, np.ones(turn + 1)]), curvature=False)
+        with_prior = optimum.log_joint + _log_prior_of_steps(found, loading)
+        if with_prior <= value:
+            break
+        value, now = with_prior, replace(start, design=design, optimum=optimum)
+        best, steps = RandomEffects(variant, {}, value, now, more), list(found)
+    if best is None:
+        return None
+    at = fit_hypothesis(base, start.state, start.variants, start.theta, best.at.optimum.hyper, best.more)
+    jumps = _jumps(base, steps, unit * at.solution.own[:, 5:])
+    return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=jumps) if jumps else None
 
 
-def _log_joints(found: Mapping[Names, Hypothesis], count: int) -> dict[Names, float]:
-    """Log evidence and log prior of every hypothesis; of pairs those with a second name of credible size."""
-    priors = {0: 0.0, 1: -np.log(count), 2: -DECISIONS.pair - np.log(max(count * (count - 1) / 2, 1))}
-    logs = {
-        n: one.log_evidence + (-DECISIONS.unlisted if n == UNLISTED else priors[len(n)]) for n, one in found.items()
-    }
-    for names, one in found.items():
-        if len(names) == 1 and np.isfinite(one.with_discrepancy):
-            # Two causes, of which one is on no list: they count for the one that explains more by itself.
-            both = one.with_discrepancy + min(one.other_noise, 0.0) - np.log(2 * count)
-            larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
-            logs[larger] = float(np.logaddexp(logs[larger], both - DECISIONS.pair - DECISIONS.unlisted))
-    return {names: v for names, v in logs.items() if len(names) < 2 or _credible(found, names)}
+def step_scores(now: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Score and information of a step of 1 um at every point, each particle's own numbers integrated out."""
+    design, hyper = now.design, now.optimum.hyper
+    _, P, o = design.own.shape
+    own, _ = scales_of(hyper, design)
+    residual = design.data - design.common @ now.solution.common - design.amplitude @ now.solution.amplitude
+    steps = np.where(np.asarray(design.tests.mask)[..., None], np.tril(np.ones((P, P))), 0.0)
+    white = Columns(np.concatenate([design.own * own, steps, residual[..., None]], -1), design).white(hyper).columns
+    particle, step, data = white[..., :o], white[..., o:-1], white[..., -1]
+    turned = np.swapaxes(particle, 1, 2)
+    root = np.linalg.cholesky(turned @ particle + np.eye(o))
+    half = np.linalg.solve(root, turned @ white[..., o:])
+    score = np.einsum("npk,np->nk", step, data) - np.einsum("nok,no->nk", half[..., :-1], half[..., -1])
+    return score, np.sum(step**2, 1) - np.sum(half[..., :-1] ** 2, 1)
 
 
-def _that_may_be_named(logs: Mapping[Names, float]) -> dict[Names, float]:
-    fewer = max(v for names, v in logs.items() if len(names) < 2)
-    return _best_first({n: v for n, v in logs.items() if len(n) < 2 or v > fewer + DECISIONS.margin})
+def _log_prior_of_steps(found: Sequence[Step], loading: np.ndarray) -> float:
+    """Log prior of which tests have steps, how many, and where."""
+    N, k = len(loading), len({step.test for step in found})
+    places = sum(np.log(max(loading[step.test].sum(), 1)) for step in found)
+    several = (len(found) - k) * np.log(0.5)
+    return float(betaln(k + 1, N - k + 1) + several - places)
 
 
-def _credible(found: Mapping[Names, Hypothesis], names: Names) -> bool:
-    """Whether the name of a pair that explains less by itself has an amplitude that one would believe.
-
-    What takes an amplitude beyond its largest plausible one imitates what the first name's formula misses.
-    """
-    r = found[names].at
-    if r is None:
-        return True
-    second = min(names, key=lambda n: found[(n,)].log_evidence)
-    sizes = zip(r.variants, r.theta, strict=False)
-    return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
-
-
-def _best_first(logs: Mapping[Names, float]) -> dict[Names, float]:
-    return dict(sorted(logs.items(), key=lambda item: -item[1]))
+def _jumps(base: Base, found: Sequence[Step], sizes: np.ndarray) -> tuple[Jump, ...]:
+    """The steps with their sizes, those of a turn in the turn's column."""
+    force, diameter = np.asarray(base.tests.force), np.asarray(base.tests.effective_diameter)
+    jumps = []
+    for step in found:
+        i = step.test
+        stress = 1e3 * force[i, step.point] / (np.pi * diameter[i] ** 2 / 4)
+        size = float(sizes[i, step.turn])
+        if size > 0:
+            probability = float(expit((size / step.sd) ** 2 / 2 - np.log(len(force[i]))))
+            jumps.append(Jump(base.names[i], float(stress), size, step.sd, probability))
+    return tuple(jumps)

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, Point
+from ..effects import Variant
 from ..effects.record import RELOAD, UNLOAD
 from .settings import WAVES
 
@@ -90,20 +91,27 @@ def functions(names: tuple[str, ...], at: Mapping[str, np.ndarray]) -> np.ndarra
     Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so
     that one scale says how large they are together.
     """
-    columns = []
-    some = [n for n in names if float(np.max(at[n]) - np.min(at[n])) > 0]
-    for powers in itertools.product(range(DEGREE + 1), repeat=len(some)):
-        if not 0 < sum(powers) <= DEGREE:
-            continue
-        x = np.ones_like(next(iter(at.values())))
-        for n, k in zip(some, powers, strict=True):
-            x = x * np.cos(np.pi * k * at[n])
-        columns.append(x)
-    smooth = [x * np.sqrt(1.0 / max(len(columns), 1)) * np.sqrt(2) for x in columns]
-    if not columns:
+    some = [at[n] for n in names if np.ptp(at[n]) > 0]
+    if not some:
         return np.zeros((*next(iter(at.values())).shape, 0))
-    rough = [hats_of(at[n], HATS) / np.sqrt(len(some)) for n in some]
-    return np.concatenate([np.stack(smooth, -1), *rough], -1)
+    powers = (p for p in itertools.product(range(DEGREE + 1), repeat=len(some)) if 0 < sum(p) <= DEGREE)
+    smooth = np.stack([np.prod([np.cos(np.pi * k * x) for x, k in zip(some, p, strict=True)], 0) for p in powers], -1)
+    rough = [hats_of(x, HATS) / np.sqrt(len(some)) for x in some]
+    return np.concatenate([smooth * np.sqrt(1 / smooth.shape[-1]) * np.sqrt(2), *rough], -1)
+
+
+def misfit_columns(
+    variant: Variant, curve: np.ndarray, smooth: np.ndarray, siblings: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """Columns by which a formula may be wrong that adds a curve to the tests: towards its siblings, and smooth ones."""
+    size = float(np.sqrt(np.sum(curve**2)))
+    towards = []
+    for formula, column in siblings.items():
+        length = float(np.sqrt(np.sum(column**2)))
+        if formula != variant.name and length > 0:
+            likeness = float(np.sum(column * curve))
+            towards.append((column * np.copysign(size / length, likeness) - curve)[..., None])
+    return np.concatenate([*towards, curve[..., None] * smooth], -1)
 
 
 def hats_of(x: np.ndarray, count: int) -> np.ndarray:
@@ -129,8 +137,8 @@ def waves(x: np.ndarray, count: int = WAVES) -> np.ndarray:
     return np.concatenate([np.cos(angle), np.sin(angle)], -1) / np.sqrt(count - 2)
 
 
-def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np.ndarray, list[int]]:
-    """Functions of a discrepancy that no mechanism explains, and of which part each is, from 1 on.
+def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np.ndarray, ...]:
+    """Functions of a discrepancy that no mechanism explains, those of each of its parts.
 
     It is a sum of Gaussian processes, each in one coordinate and with a scale of its own, so that coordinates that
     explain nothing cost next to nothing (automatic relevance determination; Duvenaud et al. 2011). All are common to
@@ -140,14 +148,9 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
     parts of its own. A stress that the loading curve lacks, and a force that the cell gets wrong, move every
     particle as far as it is soft.
     """
-    mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
-    share = (size / np.mean(size))[:, None, None]
-    since = splines(at["since"], HATS)
-    turned = [
-        np.concatenate([at[way][..., None], since * at[way][..., None]], -1) for way in ("unloading", "reloading")
-    ]
+    mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)[:, None, None]
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
-    timed = tuple(name for name in ("clock",) if name in at)
+    timed = ("clock",) if "clock" in at else ()
     reduced = [
         splines(at["peak"], FINE_SPLINES),
         *(splines(at[name], SPLINES) for name in ("strain", "travel", "load", *timed)),
@@ -157,12 +160,14 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
     ]
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)
-    stress = splines(at["strain"], SPLINES) * yielding * size[:, None, None] ** 2
+    stress = splines(at["strain"], SPLINES) * yielding * size**2
     cell = by_force * cell_errors(at["force"]) + by_peak * cell_errors(at["peak_force"])
-    parts = [*(part * share for part in reduced), of_unit(stress, mask), of_unit(cell, mask)]
-    parts += [*turned, waves(at["drive"], DRIVE_WAVES)]
-    groups = [k for k, part in enumerate(parts, 1) for _ in range(part.shape[-1])]
-    return np.where(mask[..., None], np.concatenate(parts, -1), 0.0), groups
+    parts = [*(part * (size / np.mean(size)) for part in reduced), of_unit(stress, mask), of_unit(cell, mask)]
+    for way in ("unloading", "reloading"):
+        turned = at[way][..., None]
+        parts.append(np.concatenate([turned, splines(at["since"], HATS) * turned], -1))
+    parts.append(waves(at["drive"], DRIVE_WAVES))
+    return tuple(np.where(mask[..., None], part, 0.0) for part in parts)
 
 
 def cell_errors(force: np.ndarray) -> np.ndarray:

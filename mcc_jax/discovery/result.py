@@ -18,9 +18,8 @@ from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from ..law import MccLaw
 from .base import Base
 from .closure import Closure
-from .heldout import NOT_ASKED, HeldOut
-from .locate import Place
-from .random_effects import Jump
+from .hypothesis import Jump
+from .verify import NOT_ASKED, HeldOut
 
 Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
 
@@ -68,6 +67,17 @@ class Effect:
         half = 1.96 * self.sd
         own = estimate(self.amplitude, self.sd, (self.amplitude - half, self.amplitude + half))
         fixed = {name: estimate(value) for name, value in self.nuisance.items()}
+        unit = self.variant.unit
+        jumps = [
+            {
+                "particle": jump.particle,
+                "stress_MPa": jump.stress_MPa,
+                f"size_{unit}": jump.size,
+                f"sd_{unit}": jump.sd,
+                "probability": jump.probability,
+            }
+            for jump in self.jumps
+        ]
         return {
             "mechanism": self.mechanism,
             "variant": self.variant.name,
@@ -76,48 +86,45 @@ class Effect:
             "equation": self.variant.equation,
             "explanation": self.variant.explanation,
             "parameters": {self.variant.parameter: own, **fixed} | self.estimates,
-            "unit": self.variant.unit,
+            "unit": unit,
             "differs_from_test_to_test": self.at_random,
             "misfit": self.misfit,
-        }
+        } | ({"jumps": jumps} if jumps else {})
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Measured less predicted displacement, every particle's own numbers fitted without and with what was added.
+    """Measured less predicted displacement, every particle's own numbers fitted without and with what was added."""
 
-    Attributes:
-        time_s: shape (N, points).
-        kind: kind of segment of every point, codes of `mcc_jax.effects.Record`.
-        used: which points count.
-        before, after: residuals of the base law and of the law with what was added [um].
-        white_before, white_after: the same in units of the noise, independent from point to point.
-        noise: standard deviation of what the points before do not foretell [um].
-        particles: positions of the tests in the campaign.
-    """
-
-    time_s: np.ndarray
-    kind: np.ndarray
-    used: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    white_before: np.ndarray
+    time_s: np.ndarray  # shape (N, points), as the others
+    kind: np.ndarray  # of segment, codes of `mcc_jax.effects.Record`
+    used: np.ndarray  # which points count
+    before: np.ndarray  # of the base law [um]
+    after: np.ndarray  # of the law with what was added [um]
+    white_before: np.ndarray  # in units of the noise, independent from point to point
     white_after: np.ndarray
-    noise: np.ndarray
-    particles: tuple[int, ...]
+    noise: np.ndarray  # standard deviation of what the points before do not predict [um]
+    particles: tuple[int, ...]  # positions of the tests in the campaign
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place of the map of disagreement."""
+
+    segment: str
+    load_fraction: tuple[float, float]  # range of force over the test's largest force [-]
+    share: float  # of the squared difference [-]; NaN where there are no points
+    sign: int  # +1 where more displacement is measured than the law predicts, -1 where less
+    particles: tuple[int, ...]  # rows of the tests in which most of it lies
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """How alike mechanisms look once the law has taken up what it can.
+    """How alike mechanisms look once the law has taken up what it can."""
 
-    Attributes:
-        names: members of the sets first, then the ranking from the top; shape (K,).
-        correlation: of their projected best formulas, each with its physical sign: 1 means that these data cannot
-            separate the two, -1 that one would look like the other with the impossible sign; shape (K, K).
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # members of the sets first, then the ranking from the top; shape (K,)
+    # Of their projected best formulas, each with its physical sign, shape (K, K): 1 means that these data cannot
+    # separate the two, -1 that one would look like the other with the impossible sign.
     correlation: np.ndarray
 
 
@@ -129,8 +136,7 @@ class Discovery(Saved):
         verdict: NO_GAP, NAMED, SET, UNLISTED or FIT_NOT_CONVERGED.
         summary: the answer in one paragraph.
         base: the tests and the base law; None where it could not be fitted.
-        model: the model with what was found in it; that of the base law where no name was, or where each test has
-            sudden steps of its own.
+        model: with what was found in it; that of the base law without a name, or where tests have steps of their own.
         effects: what was added, in order.
         candidate_set: for each effect, the mechanisms that may be in its place, most probable first.
         pairs: two names each that together may be in place of the one that was added.
@@ -140,19 +146,18 @@ class Discovery(Saved):
         closure: a curve and a formula where no listed mechanism explains the gap.
         held_out: the gap on particles that took no part; None if not asked for.
         p_any: probability of so much evidence of anything if nothing were missing.
-        parameters_before, parameters_after: the population's parameters by the law alone, as a calibration has them,
-            and with the effects.
+        parameters_before, parameters_after: the population's parameters by the law alone and with the effects.
         next_experiments: further tests that would probably separate the members of a set.
         seed, runtime_s: for the record.
         leads: what remains in addition to the names and is not added to the law.
-        checks: for every member of a set with rivals, what would show it by itself: `mechanism`, `check`.
-        posterior: of the law with effects; None where nothing was added that a `Model` holds, or it was not asked for.
+        checks: for every member of a set, what would show it by itself: `mechanism`, `check`.
+        posterior: of the law with effects; None where no `Model` holds what was added, or it was not asked for.
         notes: what a reader must know.
         findings: what the checks of the tests found, and which particles took no part for it.
         residuals: of every test, without and with what was added; None where the base law was not fitted.
         places: the whole map of disagreement.
         likeness: which mechanisms look alike; None where there was nothing to compare.
-        before: the calibration in whose folder it was saved, as `mcc.load` finds it; None otherwise.
+        before: the calibration in whose folder `mcc.load` found it.
     """
 
     content_file, archive_file = "discovery.json", DISCOVERY_ARCHIVE
@@ -199,8 +204,7 @@ class Discovery(Saved):
         """The calibrated law with the effects that were added: of the median particle, or of one of the tests.
 
         Raises:
-            InputError: if there was no fit, the gap is closed by a formula that no listed mechanism has, or the law of
-                one test is asked for where the law with effects has no posterior.
+            InputError: if there was no fit, a formula closes the gap, or one test's law is wanted without a posterior.
         """
         if self.closure is not None:
             remedy = "Draw or tabulate it: its terms are in discovery.json."
@@ -217,11 +221,6 @@ class Discovery(Saved):
         law = law_of(numbers | (self.parameters_after or self.parameters_before))
         return law.with_effects(*(effect.build() for effect in self.effects))
 
-    @property
-    def paired(self) -> set[str]:
-        """The mechanisms that only two together may be in place of the one that was added."""
-        return {name for pair in self.pairs for name in pair}
-
     def gap(self) -> dict[str, Any]:
         """The gap at every step, on held-out particles."""
         return dict(NOT_ASKED) if self.held_out is None else self.held_out.to_json()
@@ -229,10 +228,7 @@ class Discovery(Saved):
     def correction_um(self, *, held_out: bool = False) -> dict[str, np.ndarray]:
         """Displacement that the formula adds to the base law's at every row of every test that took part [um].
 
-        Empty without a formula. Rows that the fit leaves out, of an approach or of a record that was thinned, are NaN.
-
-        Args:
-            held_out: every test by the weights that the tests without it make.
+        Empty without a formula; NaN at rows that the fit leaves out. With `held_out`, the other tests give the weights.
         """
         if self.closure is None or self.base is None:
             return {}
@@ -244,25 +240,6 @@ class Discovery(Saved):
             found[self.base.campaign.particles[i]] = whole
         return found
 
-    def name_of(self, row: int) -> str:
-        """The particle of a row of the tests that took part."""
-        return str(row + 1) if self.base is None else self.base.name_of(row)
-
-    def _jumps(self, effect: Effect) -> dict[str, Any]:
-        """The sudden steps of an effect."""
-        unit = effect.variant.unit
-        jumps = [
-            {
-                "particle": self.name_of(jump.particle),
-                "stress_MPa": jump.stress_MPa,
-                f"size_{unit}": jump.size,
-                f"sd_{unit}": jump.sd,
-                "probability": jump.probability,
-            }
-            for jump in effect.jumps
-        ]
-        return {"jumps": jumps} if jumps else {}
-
     @cached_property
     def content(self) -> dict[str, Any]:
         """The contents of `discovery.json`, worked out once."""
@@ -270,7 +247,7 @@ class Discovery(Saved):
             "schema": 1,
             "verdict": self.verdict,
             "summary": self.summary,
-            "effects": [effect.to_json() | self._jumps(effect) for effect in self.effects],
+            "effects": [effect.to_json() for effect in self.effects],
             "candidate_set": [list(names) for names in self.candidate_set],
             "candidate_pairs": [list(names) for names in self.pairs],
             "ranking": list(self.ranking),

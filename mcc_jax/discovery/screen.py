@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +18,122 @@ from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Point
 from ..calibrate.priors import SCALES
-from ..effects import AbstractEffect, Mechanism
-from ..law import signatures
+from ..effects import AbstractEffect, Mechanism, Need, Nuisance, Variant
+from ..law import PUNCH_AREA, signatures
 from .base import Base, State
-from .candidates import Candidate, candidates_of
-from .columns import with_amplitudes
 from .design import design_of
 from .evidence import LinearModel, log_prior
 from .settings import LENGTH_FACTORS, NOISE_FACTORS
 
 SPREAD_FACTORS = 1.0, 0.5  # on the spreads of the base fit, at which all formulas are screened
+
+# Values tried of a number that differs from test to test.
+LOCATIONS = 32  # of a place between two that lie far apart, which must be met closely
+PHASES = 14  # of a phase
+
+PUNCH = "punch_radius_um"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One formula with fixed nuisance parameters, of which only the amplitude is unknown."""
+
+    variant: Variant
+    nuisance: Mapping[str, float]
+
+    @property
+    def mechanism(self) -> str:
+        """Name of the mechanism."""
+        return self.variant.mechanism
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Formulas of which only the amplitudes are unknown, and what they add to the tests."""
+
+    each: tuple[Candidate, ...]
+    columns: np.ndarray  # signatures at the base law, per smallest plausible amplitude
+
+    def of(self, library: Mapping[str, Mechanism]) -> Candidates:
+        """Those of a library."""
+        known = [variant for mechanism in library.values() for variant in mechanism.variants]
+        rows = np.array([k for k, c in enumerate(self.each) if c.variant in known], int)
+        return Candidates(tuple(self.each[k] for k in rows), self.columns[..., rows])
+
+    @cached_property
+    def mechanisms(self) -> np.ndarray:
+        """Names of their mechanisms."""
+        return np.array([c.mechanism for c in self.each], object)
+
+    @cached_property
+    def signs(self) -> np.ndarray:
+        """Physical signs of the amplitudes."""
+        return np.array([c.variant.sign for c in self.each], float)
+
+    @cached_property
+    def largest(self) -> np.ndarray:
+        """Largest plausible amplitudes over the smallest."""
+        return np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.each], float)
+
+
+def candidates_of(library: Mapping[str, Mechanism]) -> tuple[Candidate, ...]:
+    """All formulas of a library in its order, at every value of their grids."""
+    found = []
+    for variant in (v for mechanism in library.values() for v in mechanism.variants):
+        names = [n.name for n in variant.nuisances]
+        grid = itertools.product(*map(_values, variant.nuisances))
+        found += [Candidate(variant, dict(zip(names, map(float, values), strict=True))) for values in grid]
+    return tuple(found)
+
+
+def _values(number: Nuisance) -> Sequence[float]:
+    """Values of a further number: of what differs from test to test finer ones, by ratio over more than a factor 3."""
+    low, high = number.plausible
+    if not number.random_per_test:
+        return number.grid
+    return list(np.geomspace(low, high, LOCATIONS) if low > 0 and high > 3 * low else np.linspace(low, high, PHASES))
+
+
+def located(variant: Variant) -> bool:
+    """Whether a further number of the formula differs from test to test, which no `Model` holds."""
+    return any(n.random_per_test for n in variant.nuisances)
+
+
+def untestable(
+    library: Mapping[str, Mechanism], present: frozenset[Need]
+) -> tuple[dict[str, Mechanism], list[dict[str, str]]]:
+    """The mechanisms and variants whose needs the data meet; name and needs of each mechanism that has none."""
+    testable: dict[str, Mechanism] = {}
+    missing = []
+    for name, mechanism in library.items():
+        possible = tuple(v for v in mechanism.variants if set(v.needs) <= present)
+        if possible:
+            testable[name] = replace(mechanism, variants=possible)
+        else:
+            least = min((set(v.needs) - present for v in mechanism.variants), key=len)
+            missing.append({"mechanism": name, "needs": " and ".join(sorted(need.value for need in least))})
+    return testable, missing
+
+
+def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
+    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be:
+    otherwise it would be nothing but another name for the compliance of the frame."""
+    diameter, tests = base.campaign.metadata.punch_diameter_um, base.tests
+    ends = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1)
+    travel = np.maximum(ends - np.asarray(base.state.point.zero), 0.0)
+    widest = float(np.max(np.sqrt(PUNCH_AREA * np.asarray(tests.effective_diameter) * travel)))
+
+    def known(variant: Variant) -> Variant | None:
+        others = tuple(n for n in variant.nuisances if n.name != PUNCH)
+        if len(others) == len(variant.nuisances):
+            return variant
+        if diameter is None or 2 * widest <= diameter:
+            return None
+        radius = Nuisance(PUNCH, (diameter / 2,), (diameter / 2, diameter / 2), "radius of the flat punch, as recorded")
+        return replace(variant, nuisances=(*others, radius))
+
+    kept = {name: tuple(filter(None, map(known, m.variants))) for name, m in library.items()}
+    return {name: replace(library[name], variants=variants) for name, variants in kept.items() if variants}
 
 
 @compiled_quickly
@@ -40,81 +147,60 @@ def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect,
     return jax.vmap(one)(point.latent, tests)
 
 
-class Setting(NamedTuple):
-    """Candidates at some hyperparameters, all else integrated out, in units of their smallest plausible amplitudes."""
-
-    log_null: float  # log marginal likelihood without any, times the hyperparameters' prior
-    gram: np.ndarray  # information among candidates
-    score: np.ndarray
+def with_signatures(base: Base, state: State, candidates: Sequence[Candidate]) -> Candidates:
+    """Candidates with their signatures at the base law."""
+    effects = tuple(c.variant.build(0.0, **c.nuisance) for c in candidates)
+    columns = base.each(candidate_columns, state.point, effects, base.forms)
+    return Candidates(tuple(candidates), np.asarray(columns) * [c.variant.plausible[0] for c in candidates])
 
 
 @dataclass(frozen=True)
 class Screen:
-    """All candidates against the base law, at each of the hyperparameters that were tried."""
+    """Candidates against the base law, all else integrated out, in units of their smallest plausible amplitudes.
 
-    candidates: tuple[Candidate, ...]
-    settings: tuple[Setting, ...]
-    columns: np.ndarray  # signatures of the candidates, per smallest plausible amplitude
+    Arrays have an entry for each of the hyperparameters that were tried, those of the base law first.
+    """
 
-    @property
-    def null(self) -> float:
-        """Log marginal likelihood without any, at its best setting."""
-        return max(s.log_null for s in self.settings)
+    candidates: Candidates
+    log_null: np.ndarray  # log marginal likelihood without any, times the hyperparameters' prior
+    gram: np.ndarray  # information among candidates
+    score: np.ndarray
 
-    @property
-    def signs(self) -> np.ndarray:
-        """Physical signs of the candidates."""
-        return np.array([c.variant.sign for c in self.candidates])
-
-    @property
-    def largest(self) -> np.ndarray:
-        """Largest plausible amplitudes of the candidates over the smallest."""
-        return np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
-
-    def singles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Log marginal likelihood of each candidate at its best setting, and its amplitude there in natural units."""
-        signs, largest = self.signs, self.largest
-        best = np.full(len(signs), -np.inf)
-        amplitude = np.zeros(len(signs))
-        for s in self.settings:
-            value, mean = single_integrals(s.score, np.diagonal(s.gram), signs, largest)
-            better = s.log_null + value > best
-            best, amplitude = np.where(better, s.log_null + value, best), np.where(better, mean, amplitude)
-        return best, amplitude * np.array([c.variant.plausible[0] for c in self.candidates])
+    def singles(self) -> np.ndarray:
+        """Log marginal likelihood of each candidate at its best setting."""
+        information = np.diagonal(self.gram, axis1=1, axis2=2)
+        each = single_integrals(self.score, information, self.candidates.signs, self.candidates.largest)
+        return np.max(self.log_null[:, None] + each, 0)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Candidates of every two mechanisms, first and second, and log marginal likelihood of both, each at its best
         setting."""
-        a, b = np.triu_indices(len(self.candidates), 1)
-        names = np.array([c.mechanism for c in self.candidates])
-        two = names[a] != names[b]
-        a, b = a[two], b[two]
-        each = [s.log_null + pair_integrals(s.gram, s.score, a, b, self.signs, self.largest) for s in self.settings]
-        return a, b, np.max(each, 0)
+        a, b = np.triu_indices(len(self.candidates.each), 1)
+        two = self.candidates.mechanisms[a] != self.candidates.mechanisms[b]
+        a, b, signs, largest = a[two], b[two], self.candidates.signs, self.candidates.largest
+        each = [pair_integrals(G, s, a, b, signs, largest) for G, s in zip(self.gram, self.score, strict=True)]
+        return a, b, np.max(self.log_null[:, None] + each, 0)
 
     @property
     def information(self) -> np.ndarray:
-        """Information on each candidate's amplitude at the first setting, in units of the smallest plausible one."""
-        return np.diagonal(self.settings[0].gram)
+        """Information on each candidate's amplitude under the base law's hyperparameters."""
+        return np.diagonal(self.gram[0])
 
     @property
     def similarity(self) -> np.ndarray:
-        """Correlations of the candidates' projected signatures at the first setting."""
+        """Correlations of the candidates' projected signatures there."""
         root = np.sqrt(np.maximum(self.information, 1e-300))
-        return self.settings[0].gram / root / root[:, None]
+        return self.gram[0] / root / root[:, None]
 
 
-def single_integrals(
-    score: np.ndarray, information: np.ndarray, signs: np.ndarray, largest: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Log integral over each amplitude alone, and its mean under the best scale."""
-    scale = np.exp(np.linspace(0, 1, SCALES)[:, None] * np.log(largest)[None])
-    precision = information[None] + scale**-2.0
-    mean = score[None] / precision
-    value = 0.5 * score[None] * mean - 0.5 * np.log(precision) - np.log(scale)
-    value += np.where(signs == 0, 0.0, np.log(2) + log_ndtr(signs * mean * np.sqrt(precision)))
-    best = np.argmax(value, 0)
-    return logsumexp(value, axis=0) - np.log(SCALES), mean[best, np.arange(len(score))]
+def single_integrals(score: Any, information: Any, signs: Any, largest: Any) -> Any:
+    """Log integrals over amplitudes, each alone, of any shape; see `evidence.amplitudes` for their prior."""
+    scale = np.exp(np.linspace(0, 1, SCALES).reshape(-1, *[1] * np.ndim(score)) * np.log(largest))
+    precision = information + scale**-2.0
+    mean = score / precision
+    value = 0.5 * score * mean - 0.5 * np.log(precision) - np.log(scale)
+    value += np.where(np.equal(signs, 0), 0.0, np.log(2) + log_ndtr(signs * mean * np.sqrt(precision)))
+    return logsumexp(value, axis=0) - np.log(SCALES)
 
 
 def pair_integrals(
@@ -122,54 +208,23 @@ def pair_integrals(
 ) -> np.ndarray:
     """Log integral over two amplitudes, for many pairs of rows `a` and `b`."""
     found = []
-    for one in np.linspace(0, 1, SCALES):
-        for two in np.linspace(0, 1, SCALES):
-            sa, sb = largest[a] ** one, largest[b] ** two
-            p, q, r = gram[a, a] + sa**-2.0, gram[b, b] + sb**-2.0, gram[a, b]
-            det = np.maximum(p * q - r * r, 1e-12 * p * q)
-            ma, mb = (q * score[a] - r * score[b]) / det, (p * score[b] - r * score[a]) / det
-            value = 0.5 * (score[a] * ma + score[b] * mb) - 0.5 * np.log(det) - np.log(sa * sb)
-            for m, sd, sign in ((ma, np.sqrt(q / det), signs[a]), (mb, np.sqrt(p / det), signs[b])):
-                value = value + np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * m / sd))
-            found.append(value)
+    for one, two in itertools.product(np.linspace(0, 1, SCALES), repeat=2):
+        sa, sb = largest[a] ** one, largest[b] ** two
+        p, q, r = gram[a, a] + sa**-2.0, gram[b, b] + sb**-2.0, gram[a, b]
+        det = np.maximum(p * q - r * r, 1e-12 * p * q)
+        ma, mb = (q * score[a] - r * score[b]) / det, (p * score[b] - r * score[a]) / det
+        value = 0.5 * (score[a] * ma + score[b] * mb) - 0.5 * np.log(det) - np.log(sa * sb)
+        for m, sd, sign in ((ma, np.sqrt(q / det), signs[a]), (mb, np.sqrt(p / det), signs[b])):
+            value = value + np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * m / sd))
+        found.append(value)
     return np.asarray(logsumexp(np.stack(found), axis=0)) - 2 * np.log(SCALES)
 
 
-def testable_columns(
-    base: Base, state: State, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism]
-) -> tuple[tuple[Candidate, ...], np.ndarray]:
-    """The formulas of a library that tests can distinguish, and their signatures.
-
-    Those of the whole library are worked out: campaigns that distinguish different ones share what is compiled.
-    """
-    every = candidates_of(whole)
-    rows = [k for k, c in enumerate(every) if c.mechanism in testable and c.variant in testable[c.mechanism].variants]
-    return tuple(every[k] for k in rows), signature_columns(base, state, every)[..., np.array(rows, int)]
-
-
-def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> np.ndarray:
-    """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
-    effects = tuple(c.effect for c in candidates)
-    columns = base.each(candidate_columns, state.point, effects, base.forms)
-    return np.asarray(columns) * np.array([c.variant.plausible[0] for c in candidates])
-
-
-def screen(
-    base: Base,
-    state: State,
-    hyper: np.ndarray,
-    candidates: Sequence[Candidate],
-    columns: np.ndarray,
-    *,
-    several: bool = True,
-) -> Screen:
-    """Scores of candidates around the base law, at its hyperparameters first and at `several` other settings of them.
-
-    `columns` are the candidates' signatures as `signature_columns` gives them.
-    """
-    design = with_amplitudes(design_of(base, state), columns)
-    settings = []
+def screen(base: Base, state: State, hyper: np.ndarray, candidates: Candidates, *, several: bool = True) -> Screen:
+    """Scores of candidates around the base law, at its hyperparameters first and at `several` other settings."""
+    design = design_of(base, state).with_amplitudes(candidates.columns)
     grid = itertools.product(NOISE_FACTORS, LENGTH_FACTORS, SPREAD_FACTORS)
+    log_null, gram, score = [], [], []
     for sd, length, spread in grid if several else [(1.0, 1.0, 1.0)]:
         at = hyper.copy()
         at[2:4] += np.log([sd, length])
@@ -177,11 +232,13 @@ def screen(
         model = LinearModel(at, design)
         shared = model.shared()
         null = float(np.sum(model.log_integral) + shared.log_integral) - 0.5 * shared.schur[-1, -1]
-        settings.append(Setting(null + log_prior(at, design)[0], shared.information, shared.score))
-    return Screen(tuple(candidates), tuple(settings), columns)
+        log_null.append(null + log_prior(at, design)[0])
+        gram.append(shared.information)
+        score.append(shared.score)
+    return Screen(candidates, np.array(log_null), np.array(gram), np.array(score))
 
 
-def first_order(base: Base, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism] | None = None) -> Screen:
-    """Scores of a library around the base law at its own hyperparameters, or of those that tests can distinguish."""
-    candidates, columns = testable_columns(base, base.state, whole, whole if testable is None else testable)
-    return screen(base, base.state, base.hyperparameters, candidates, columns, several=False)
+def first_order(base: Base, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism]) -> Screen:
+    """Scores around the base law at its own hyperparameters of what of a whole library the tests can show."""
+    candidates = with_signatures(base, base.state, candidates_of(whole)).of(testable)
+    return screen(base, base.state, base.hyperparameters, candidates, several=False)

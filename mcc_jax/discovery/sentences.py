@@ -12,11 +12,12 @@ from .settings import AT_PEAKS, DECISIONS, ENOUGH, WITHIN
 if TYPE_CHECKING:
     from .result import Discovery, Effect
 
+NOTHING_MISSING = "nothing missing"
 JUMPS, CHECKS = 5, 3  # sudden steps and checks that a summary lists
 
 
 def within_noise(gap: Mapping[str, Any]) -> bool | None:
-    """Whether held-out particles agree with what was added within the noise; None where nobody knows."""
+    """Whether held-out particles agree with what was added within the noise; None where that is not known."""
     if gap["closed_fraction"] is None or not gap["steps"]:
         return None
     last = gap["steps"][-1]
@@ -26,64 +27,54 @@ def within_noise(gap: Mapping[str, Any]) -> bool | None:
 
 def verdict_in_words(content: Mapping[str, Any]) -> str:
     """The verdict of a `discovery.json` for people, in a few words."""
-    match content["verdict"]:
-        case "NO_GAP":
-            return "nothing missing"
-        case "FIT_NOT_CONVERGED":
-            return "no answer, the law could not be fitted"
-        case "UNLISTED":
-            return "unlisted effect, described by a formula"
     names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
-    if content["verdict"] == "SET":
-        return f"effect not unique: {names} or what looks like it"
-    return f"effect{'s' if len(content['effects']) > 1 else ''} identified: {names}"
+    return {
+        "NO_GAP": NOTHING_MISSING,
+        "FIT_NOT_CONVERGED": "no answer, the law could not be fitted",
+        "UNLISTED": "unlisted effect, described by a formula",
+        "SET": f"effect not unique: {names} or what looks like it",
+        "NAMED": f"effect{'s' if len(content['effects']) > 1 else ''} identified: {names}",
+    }[content["verdict"]]
 
 
 def headline(content: Mapping[str, Any], tests: str = "tests") -> str:
     """The answer of a `discovery.json` in one sentence; `tests` is what the tests are called."""
-    match content["verdict"]:
-        case "NO_GAP":
-            return "Nothing is missing in the law that these tests could show."
-        case "FIT_NOT_CONVERGED":
-            return "The law could not be fitted well enough to ask what it lacks."
+    if content["verdict"] == "NO_GAP":
+        return "Nothing is missing in the law that these tests could show."
+    if content["verdict"] == "FIT_NOT_CONVERGED":
+        return "The law could not be fitted well enough to ask what it lacks."
     closed = within_noise(content["gap"])
     agree = f"law and {tests} agree within the noise" if closed else "part of the gap closes, and part remains"
-    return f"{_missing(content)}{'' if closed is None else f'; with it added, {agree}'}."
+    missing = _missing(content["verdict"], [effect["mechanism"] for effect in content["effects"]])
+    return f"{missing}{'' if closed is None else f'; with it added, {agree}'}."
 
 
-def _missing(content: Mapping[str, Any]) -> str:
-    if content["verdict"] == "UNLISTED" or not content["effects"]:
+def _missing(verdict: str, names: Sequence[str]) -> str:
+    if verdict == "UNLISTED" or not names:
         return "The law misses something that no listed mechanism explains"
-    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
-    return f"The law misses {names}{', or what looks like it' if content['verdict'] == 'SET' else ''}"
+    return f"The law misses {listed(list(map(plain, names)))}{', or what looks like it' if verdict == 'SET' else ''}"
+
+
+def taken_back(names: Sequence[str], objection: str) -> str:
+    """One paragraph: what would explain the tests does not hold on held-out particles; `names` of mechanisms."""
+    most = listed(list(map(plain, names))) if names else "a formula of its own"
+    return (
+        f"The law does not describe these tests, and nothing was found that does. What explains most is {most}, but "
+        f"of particles that took no part {objection}. Look at the tests one by one: records that run on through slips "
+        "or breakage, particles of several kinds, or another material than the law was made for would do this; leave "
+        "out what is no test of one particle, and discover again."
+    )
 
 
 def summary_of(found: Discovery) -> str:
     """One paragraph: what is missing, where, how sure, what that did, what next."""
-    count = len(found.base.selection.kept) if found.base is not None else 0
-    sentences = [_verdict(found, count)]
+    sentences = [_verdict(found)]
     for effect, names in zip(found.effects, found.candidate_set, strict=True):
-        unit = "" if effect.variant.unit == "-" else f" {effect.variant.unit}"
-        value = f"{plain(effect.variant.name)}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
-        sentences.append(f"It is {plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
-        if effect.jumps:
-            sentences.append(_jumps(found, effect))
-        elif abs(effect.amplitude) > effect.variant.plausible[1]:
-            most = f"{effect.variant.plausible[1]:g}{unit}"
-            sentences.append(
-                f"That is more than is plausible (at most {most}): something else may be in it, and the parameters "
-                "beside it are as doubtful."
-            )
-        rivals = [plain(n) for n in names if n != effect.mechanism and n not in found.paired]
-        rivals += [" together with ".join(map(plain, pair)) for pair in found.pairs]
-        if rivals:
-            sentences.append(f"These tests cannot distinguish it from {listed(rivals, 'or')}.")
-        if effect.misfit > 2 * DECISIONS.misfit:
-            sentences.append(f"Its formula is off by about {100 * effect.misfit:.0f} % of the effect.")
+        sentences += _effect(effect, names, found.pairs)
     if found.closure is not None:
         near = f", most like {plain(found.closure.resembles[0][0])}" if found.closure.resembles else ""
         sentences.append(f"A formula describes it{near}: {found.closure.formula}.")
-    sentences += _gap(found)
+    sentences += _gap(found.gap())
     if found.leads:
         each = [f"{plain(one['mechanism'])} ({max(100 * one['share'], 0.1):.2g} %)" for one in found.leads]
         text = f"Beside it, a share of the evidence may be due to {listed(each, 'or')}; that is not added to the law."
@@ -97,7 +88,65 @@ def summary_of(found: Discovery) -> str:
     return " ".join(sentences)
 
 
-def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
+def _verdict(found: Discovery) -> str:
+    """What is missing, and where, in one sentence."""
+    count = len(found.base.selection.kept) if found.base is not None else 0
+    chance = f"probability of so much evidence by chance: {found.p_any:.2g}"
+    if found.verdict == "NO_GAP":
+        return (
+            f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
+        )
+    place = ""
+    if found.where:
+        first = found.where[0]
+        low, high = (f"{100 * share:.0f}" for share in first["load_fraction"])
+        part = f"{first['segment']} between {low} and {high} % of the largest load"
+        part = "holds" if first["segment"] == "hold" else part
+        place = f", most of all in {part}, in {len(first['particles'])} particles"
+    missing = _missing(found.verdict, [e.mechanism for e in found.effects])
+    return f"{missing}: law and {count} tests disagree{place} ({chance})."
+
+
+def _effect(effect: Effect, names: Sequence[str], pairs: Sequence[Sequence[str]]) -> list[str]:
+    """An effect with its numbers, and what may be in its place."""
+    unit, (_, most) = "" if effect.variant.unit == "-" else f" {effect.variant.unit}", effect.variant.plausible
+    value = f"{plain(effect.variant.name)}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
+    sentences = [f"It is {plain(effect.mechanism)} with probability {effect.probability:.2f} ({value})."]
+    if effect.jumps:
+        largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:JUMPS]
+        each = [f"{j.size:.2g} {effect.variant.unit} at {j.stress_MPa:.2g} MPa in {j.particle}" for j in largest]
+        more = len(effect.jumps) - len(largest)
+        sentences.append(f"It jumps by {', by '.join(each)}{f' and {more} more' if more else ''}.")
+    elif abs(effect.amplitude) > most:
+        sentences.append(
+            f"That is more than is plausible (at most {most:g}{unit}): something else may be in it, and the parameters "
+            "beside it are as doubtful."
+        )
+    paired = {name for pair in pairs for name in pair}
+    rivals = [plain(n) for n in names if n != effect.mechanism and n not in paired]
+    rivals += [" together with ".join(map(plain, pair)) for pair in pairs]
+    if rivals:
+        sentences.append(f"These tests cannot distinguish it from {listed(rivals, 'or')}.")
+    if effect.misfit > 2 * DECISIONS.misfit:
+        sentences.append(f"Its formula is off by about {100 * effect.misfit:.0f} % of the effect.")
+    return sentences
+
+
+def _gap(gap: Mapping[str, Any]) -> list[str]:
+    if gap["closed_fraction"] is None:
+        return []
+    first, last = gap["steps"][0], gap["steps"][-1]
+    sentences = [
+        f"On held-out particles it closes {100 * gap['closed_fraction']:.0f} % of the gap (chi2 per point "
+        f"{first['chi2_per_dof']:.3g} before, {last['chi2_per_dof']:.3g} after; 1 is noise alone)."
+    ]
+    still = last["chi2_interval_95"][0]
+    if still is not None and still > 1 + WITHIN:
+        sentences.append("The gap is named, not closed: the formula does not describe all of it.")
+    return sentences
+
+
+def _modulus(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """What the addition did to the modulus: to that at the peaks, where formulas of the modulus take it elsewhere."""
     own, now, was = after["effective_modulus_MPa"], after[AT_PEAKS], before[AT_PEAKS]
     if is_unknown(now):
@@ -106,41 +155,12 @@ def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
     return f"With it the effective modulus{where} is {with_sd(now, 1e-3)} GPa instead of {with_sd(was, 1e-3)} GPa."
 
 
-def _verdict(found: Discovery, count: int) -> str:
-    """What is missing, and where, in one sentence."""
-    chance = f"probability of so much evidence by chance: {found.p_any:.2g}"
-    if found.verdict == "NO_GAP":
-        return (
-            f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
-        )
-    names = " and ".join(plain(e.mechanism) for e in found.effects)
-    lead = f"The law misses {names}" if names else "The law misses something that no listed mechanism explains"
-    if found.verdict == "SET":
-        lead += ", or what looks like it"
-    return f"{lead}: law and {count} tests disagree{_place(found)} ({chance})."
-
-
-def _gap(found: Discovery) -> list[str]:
-    gap = found.gap()
-    if gap["closed_fraction"] is None:
-        return []
-    first, last = (step["chi2_per_dof"] for step in (gap["steps"][0], gap["steps"][-1]))
-    open_still = gap["steps"][-1]["chi2_interval_95"][0]
-    sentences = [
-        f"On held-out particles it closes {100 * gap['closed_fraction']:.0f} % of the gap "
-        f"(chi2 per point {first:.3g} before, {last:.3g} after; 1 is noise alone)."
-    ]
-    if open_still is not None and open_still > 1 + WITHIN:
-        sentences.append("The gap is named, not closed: the formula does not describe all of it.")
-    return sentences
-
-
 def next_tests(experiments: Sequence[Mapping[str, Any]], checks: Sequence[Mapping[str, str]]) -> list[str]:
     """Which further test, or which direct checks, would separate the candidates, in sentences."""
-    sentences = []
-    best = experiments[0] if experiments else None
-    sure = best is not None and best["power"] >= ENOUGH
-    if best is not None:
+    sentences, sure = [], False
+    if experiments:
+        best = experiments[0]
+        sure = best["power"] >= ENOUGH
         names = listed([plain(n) for n in best["separates"]], "or")
         doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
         sentences.append(
@@ -151,22 +171,3 @@ def next_tests(experiments: Sequence[Mapping[str, Any]], checks: Sequence[Mappin
         each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in checks[:CHECKS])
         sentences.append(f"Each would show by itself ({each}).")
     return sentences
-
-
-def _jumps(found: Discovery, effect: Effect) -> str:
-    """The largest sudden steps, one by one."""
-    largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:JUMPS]
-    unit = effect.variant.unit
-    each = [f"{j.size:.2g} {unit} at {j.stress_MPa:.2g} MPa in {found.name_of(j.particle)}" for j in largest]
-    more = len(effect.jumps) - len(largest)
-    return f"It jumps by {', by '.join(each)}{f' and {more} more' if more else ''}."
-
-
-def _place(found: Discovery) -> str:
-    if not found.where:
-        return ""
-    first = found.where[0]
-    low, high = first["load_fraction"]
-    part = "" if first["segment"] == "hold" else f" between {100 * low:.0f} and {100 * high:.0f} % of the largest load"
-    segment = f"{first['segment']}s" if first["segment"] == "hold" else first["segment"]
-    return f", most of all in {segment}{part}, in {len(first['particles'])} particles"

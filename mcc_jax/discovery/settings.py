@@ -56,37 +56,28 @@ class Decisions:
 
 DECISIONS = Decisions()
 
-AT_PEAKS = "modulus_at_peaks_MPa"
-"""In `discovery.json`, the modulus that acts at the peaks of the tests."""
+AT_PEAKS = "modulus_at_peaks_MPa"  # in `discovery.json`: the modulus that acts at the peaks of the tests
+POPULATION = 5  # numbers of the population, which come first in what particles share: a, log modulus, b1, b3, b5
+HYPERPARAMETERS = 8  # of the base law: four of the noise, and the spreads of b1, b3, b5 and e
 
-POPULATION = 5
-"""Numbers of the population, which come first among what all particles share: a, log modulus, means of b1, b3, b5."""
-
-HYPERPARAMETERS = 8
-"""Those of the base law: four of the noise, and the spreads of b1, b3, b5 and e."""
-
+# Nats by which a name must beat nothing before several of its formulas and second names are tried, and another kind or
+# setting of noise the one at hand.
 STRONG = 8.0
-"""Nats by which a name must beat nothing before several of its formulas and second names are tried, and another kind or
-setting of noise the one at hand."""
-
+# The same, from which on first order cannot be relied on to choose the formula; a discrepancy that begins so far below
+# another hypothesis is not computed.
 VERY_STRONG = 50.0
-"""The same, from which on first order cannot be relied on to choose the formula; a discrepancy that begins so far below
-another hypothesis is not worked out."""
 
 # Settings of correlated noise, over those of the base fit, at which all formulas are screened and a discrepancy on no
 # list begins: noise that swallowed a gap hides what explains it.
 NOISE_FACTORS = 1.0, 0.4, 0.15, 0.05
 LENGTH_FACTORS = 1.0, 0.3
 
-CONTENDERS = (
-    5  # mechanisms that are fitted at their own optimum, and hypotheses that are compared on held-out particles
-)
+CONTENDERS = 5  # mechanisms fitted at their own optimum, and hypotheses that are compared on held-out particles
 EARLY = 4  # Gauss-Newton steps that first order from an amplitude of zero may mislead
 WAVES = 12  # periods that a periodic discrepancy may have over the range of travel and of time
 
+# Estimate over standard error that is found with 95 % probability at the level: 1.645 for the probability, 2.95 for
+# the best of as many mechanisms as there are.
 DETECTABLE = 4.6
-"""Estimate over standard error that is found with 95 % probability at the level: 1.645 for the probability, 2.95 for
-the best of as many mechanisms as there are."""
-
 ENOUGH = 0.9  # probability of the right name alone from which on a further experiment is proposed without a doubt
 WITHIN = 0.05  # so far over 1 the lower end of chi2 per point may lie where a gap is called closed

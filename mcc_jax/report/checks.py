@@ -15,7 +15,7 @@ from ..calibrate.importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
 from ..calibrate.judgement import CORRELATED_SHARE, LARGE_MISFIT
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from ..discovery.sentences import headline, verdict_in_words, within_noise
+from ..discovery.sentences import NOTHING_MISSING, headline, verdict_in_words, within_noise
 from .read import CALIBRATION, DATA, Results
 from .texts import law_of
 
@@ -182,7 +182,7 @@ def _data(results: Results) -> Check:
 
 def _complete(results: Results, found: dict[str, Any]) -> Check:
     """Whether the law lacks something: by the verdict or, with what was found added, by held-out particles."""
-    name, want = "Law is complete", "nothing missing"
+    name, want = "Law is complete", NOTHING_MISSING
     if not results.has_found:
         level = OF_VERDICTS.get(found["verdict"], "look")
         return Check(level, name, verdict_in_words(found), want, headline(found))

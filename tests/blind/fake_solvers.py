@@ -10,18 +10,18 @@ def discovery(verdict, effects=(), sets=(), **more):
         "schema": 1,
         "verdict": verdict,
         "summary": "",
+        "where": [],
+        "closure": None,
         "effects": [{"mechanism": m, "variant": "v", "probability": p, "parameters": {}} for m, p in effects],
         "candidate_set": [list(s) for s in sets],
         "ranking": [{"mechanism": m, "probability": p} for m, p in effects],
-        "where": [],
-        "closure": None,
         "gap": {"floor": 1.0, "steps": []},
         **more,
     }
 
 
 def silent(folder, *, seed=0):
-    """Never finds anything; tells its process."""
+    """Never finds anything; names its process."""
     return discovery("NO_GAP", summary=str(os.getpid()))
 
 

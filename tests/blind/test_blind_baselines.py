@@ -1,5 +1,7 @@
 """The baselines: an oracle on made campaigns, AIC and the discrepancy on a small linear problem."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -8,41 +10,31 @@ from benchmarks.blind.plan import Case
 
 pytestmark = pytest.mark.extended
 
-NAME = "day-5"
+CLEAR = Case(1, "single", "first", (("thermal_drift", "exact", 20.0),), "P1", 10, "clean")
+BENDS_WITH_ITS_AMPLITUDE = Case(2, "single", "first", (("adhesion", "dugdale", 10.0),), "P1", 10, "clean")
+ON_NO_LIST = Case(3, "unlisted", "second", (("unlisted", "SerratedFlow", 100.0),), "P0", 5, "clean")
 
 
-def single(number, level, mechanism="thermal_drift", formula="exact"):
-    return Case(number, "single", "first", ((mechanism, formula, level),), "P1", 10, "clean")
-
-
-CASES = {
-    "nothing": Case(0, "null", "second", (), "P1", 10, "smooth"),
-    "clear": single(1, 20.0),
-    "bends with its amplitude": single(2, 10.0, "adhesion", "dugdale"),
-    "on no list": Case(3, "unlisted", "second", (("unlisted", "SerratedFlow", 100.0),), "P0", 5, "clean"),
-}
-
-
-def made(name, place):
+def made(case, place):
     """The folder of a sealed campaign."""
-    seal.seal(NAME, place / "work", place / "sealed", [CASES[name]])
-    return place / "work" / NAME / "campaigns" / plan.keys(5, 460)[CASES[name].number]
+    seal.seal("day-5", place / "work", place / "sealed", [case])
+    return place / "work/day-5/campaigns" / plan.keys(5, 460)[case.number]
 
 
 @pytest.mark.parametrize(
-    ("name", "verdict", "names"),
+    ("case", "verdict", "names"),
     [
-        ("nothing", "NO_GAP", []),
-        ("clear", "NAMED", ["thermal_drift"]),
-        ("bends with its amplitude", "NAMED", ["adhesion"]),
-        ("on no list", "UNLISTED", []),
+        (Case(0, "null", "second", (), "P1", 10, "smooth"), "NO_GAP", []),
+        (CLEAR, "NAMED", ["thermal_drift"]),
+        (BENDS_WITH_ITS_AMPLITUDE, "NAMED", ["adhesion"]),
+        (ON_NO_LIST, "UNLISTED", []),
     ],
 )
-def test_the_oracle_knows(name, verdict, names, tmp_path):
-    found = baselines.oracle(made(name, tmp_path))
+def test_the_oracle_knows(case, verdict, names, tmp_path):
+    found = baselines.oracle(made(case, tmp_path))
     assert adapter.problem(found) is None
     assert (found["verdict"], [e["mechanism"] for e in found["effects"]]) == (verdict, names)
-    if name == "nothing":
+    if case.kind == "null":
         assert found["p_anything_missing"] > 0.05
     if names:
         assert found["ranking"][0]["mechanism"] == names[0]
@@ -96,8 +88,6 @@ def test_marginal_likelihood_against_the_dense_one():
 
 
 def test_the_library_of_another_checkout_comes_first(monkeypatch, tmp_path):
-    import sys
-
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert adapter.find(f"checkout:{tmp_path}") is adapter.in_process
     assert sys.path[0] == str(tmp_path)
@@ -105,6 +95,6 @@ def test_the_library_of_another_checkout_comes_first(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("solver", [baselines.aic, baselines.discrepancy])
 def test_baselines_on_a_made_campaign(tmp_path, solver):
-    found = solver(made("clear", tmp_path))
+    found = solver(made(CLEAR, tmp_path))
     assert adapter.problem(found) is None
     assert found["verdict"] in ("NAMED", "UNLISTED")

@@ -4,6 +4,7 @@ import ast
 import itertools
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,6 +12,8 @@ from benchmarks.blind import make, noise, plan, world
 from benchmarks.blind.plan import Case
 from benchmarks.blind.settings import MECHANISMS, SETTINGS
 from benchmarks.blind.strength import Projection, amplitude_for, signature
+from mcc_jax import MccLaw, Particle, Plastic, drive
+from mcc_jax.campaign import read_campaign
 
 pytestmark = pytest.mark.extended
 
@@ -32,7 +35,7 @@ def imports(file):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield "." * node.level + (node.module or ",".join(alias.name for alias in node.names))
+            yield "." * node.level + (node.module or node.names[0].name)
 
 
 @pytest.mark.parametrize("name", GENERATORS.values())
@@ -71,54 +74,26 @@ def test_the_modulus_at_peaks_is_that_of_unloading_from_there(generator, mechani
         return
     given_back = []
     for curve in (drawn.curves((), None), drawn.curves(sized, None)):
-        ends = []
-        for s in drawn.slices:
-            top = int(np.argmax(drawn.force[s]))
-            low = top + int(np.argmin(drawn.force[s][top:]))
-            ends.append(np.log(curve[s][top] - curve[s][low]))
-        given_back.append(np.mean(ends))
+        tops = [s.start + int(np.argmax(drawn.force[s])) for s in drawn.slices]
+        lows = [t + int(np.argmin(drawn.force[t : s.stop])) for t, s in zip(tops, drawn.slices, strict=True)]
+        given_back.append(np.mean(np.log(curve[tops] - curve[lows])))
     if mechanism == "humidity":  # it moves the peak, too
         assert np.sign(np.log(found)) == way
     else:
         assert np.log(found) == pytest.approx(2 * (given_back[0] - given_back[1]), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("generator", "protocol"),
-    list(itertools.product(GENERATORS, plan.PROTOCOLS)),
-)
+@pytest.mark.parametrize(("generator", "protocol"), list(itertools.product(GENERATORS, plan.PROTOCOLS)))
 def test_generators_agree_with_the_law_without_effects(generator, protocol):
     """Against the library's own law, which neither knows."""
-    import jax.numpy as jnp
-
-    from mcc_jax import MccLaw, Particle, Plastic, drive
-
     _, drawn, _ = make.drawn(null(generator, protocol), 5, 0)
-    logs = drawn.deviation[:3]
-    means = {"first": (1.9027, 1.1015, 0.9784), "second": (1.9027, 1.1015, 0.9784)}[generator]
+    C = np.exp(np.array([1.9027, 1.1015, 0.9784])[:, None] + drawn.deviation[:3])
     modulus = drawn.truth["effective_modulus_MPa"] * np.exp(drawn.deviation[3])
     for i, s in enumerate(drawn.slices):
-        C = np.exp(np.array(means) + logs[:, i])
-        law = MccLaw(Plastic(*map(jnp.asarray, C)), drawn.truth["a"], jnp.asarray(modulus[i]))
+        law = MccLaw(Plastic(*map(jnp.asarray, C[:, i])), drawn.truth["a"], jnp.asarray(modulus[i]))
         sizes = [jnp.asarray(drawn.columns[f"D{k}_um"][i]) for k in (1, 2, 3)]
         there = drive(law, Particle(*sizes), jnp.asarray(drawn.force[s]), control="load")
         assert np.asarray(there.displacement) == pytest.approx(drawn.base[s], rel=2e-4, abs=2e-3)
-
-
-def test_generators_agree_with_each_other():
-    """Both laws on the same particle along the same path, to the accuracy of the second's table."""
-    from benchmarks.blind.generator import designs
-    from benchmarks.blind.generator import law as first
-    from benchmarks.blind.second import campaign
-    from benchmarks.blind.second import law as second
-
-    drawn = campaign.draw(np.random.default_rng(1), 1, "P0")
-    p, loaded = drawn.particles, drawn.path
-    particles = first.Particles(*p.D.T, *p.C.T, modulus=p.modulus)
-    force, still = loaded.force[None], np.zeros((1, len(loaded)))
-    path = designs.Path(loaded.time[None], force, still, still > 0, still, still, still, still > 0)
-    ours = first.simulate(particles, path, a=p.a)[0]
-    assert ours == pytest.approx(second.simulate(drawn), rel=1e-6, abs=1e-4)
 
 
 @pytest.mark.parametrize("generator", GENERATORS)
@@ -137,7 +112,7 @@ def test_every_formula_is_nil_at_zero_and_shows(generator):
 
 @pytest.mark.parametrize(("generator", "formula"), [("first", "exact"), ("second", "FrameLinear")])
 def test_strength_is_the_whitened_length_of_what_is_left(generator, formula):
-    rng, drawn, drawn_noise = make.drawn(single(generator, "frame_compliance", formula, 20.0), 5, 0)
+    _, drawn, drawn_noise = make.drawn(single(generator, "frame_compliance", formula, 20.0), 5, 0)
     projection = Projection(drawn, drawn_noise)
     theta, found = amplitude_for(projection, drawn.hidden[0], 20.0)
     assert found.strength == pytest.approx(20.0, rel=SETTINGS.refitting.close)
@@ -148,8 +123,6 @@ def test_strength_is_the_whitened_length_of_what_is_left(generator, formula):
     shift = world.Shift(np.full((3, drawn.count), 1e-4), np.full(drawn.count, 2e-4), 1e-4)
     own = drawn.curves((), shift) - drawn.base
     assert np.linalg.norm(projection.project(own)) < 0.02 * np.linalg.norm(projection.whiten(own))
-    whitened = projection.whiten(noise.sample(rng, drawn_noise, drawn)[0] * 0 + 1.0)
-    assert np.all(np.isfinite(whitened))
 
 
 @pytest.mark.parametrize("kind", ["clean", "rough", "smooth", "heavy", "scale"])
@@ -159,9 +132,8 @@ def test_noise_has_its_covariance(kind):
     projection = Projection(drawn, drawn_noise)
     on_displacement, on_force = noise.sample(rng, drawn_noise, drawn)
     left = projection.project(on_displacement - noise.slopes(drawn) * on_force)
-    number = len(drawn.force)
-    heavy = 4.0 if kind == "heavy" else 1.0
-    assert left @ left == pytest.approx(number, abs=heavy * 6 * np.sqrt(2 * number))
+    tolerance = (24 if kind == "heavy" else 6) * np.sqrt(2 * len(left))
+    assert left @ left == pytest.approx(len(left), abs=tolerance)
 
 
 @pytest.mark.parametrize("fault", ["force_zero", "clipping", "breakage"])
@@ -175,14 +147,11 @@ def test_faults(fault):
     elif fault == "clipping":
         assert there.displacement.max() == told["limit_um"] < before.displacement.max()
     else:
-        changed = {str(i + 1) for i in range(10)
-                   if not np.array_equal(there.force[there.owner == i], before.force[before.owner == i])}  # fmt: skip
-        assert changed == set(told["particles"])
+        pairs = [(there.force[there.owner == i], before.force[before.owner == i]) for i in range(10)]
+        assert {str(i + 1) for i, pair in enumerate(pairs) if not np.array_equal(*pair)} == set(told["particles"])
 
 
 def test_a_made_case_is_written_and_read_by_the_library(tmp_path):
-    from mcc_jax.campaign import read_campaign
-
     case = single("first", "thermal_drift", "exact", 20.0)
     made = make.make(case, 5)
     make.write(made, tmp_path / "one")

@@ -43,13 +43,8 @@ def test_the_seal_holds_and_breaks(sealed):
         seal.seal("day-3", place / "work", place / "other", cases)
     with pytest.raises(SystemExit, match="DATE-SEED"):
         seal.master_of("today")
-
-
-def test_tasks_say_nothing_of_what_is_hidden(sealed):
-    place, *_ = sealed
-    tasks = json.loads((place / "work/day-3/tasks.json").read_text())
+    tasks = json.loads((place / "work/day-3/tasks.json").read_text())  # nothing of what is hidden
     assert all(list(task) == ["subset"] for task in tasks.values())
-    assert not {"mechanism", "effects"} & set((place / "work/day-3/tasks.json").read_text().split('"'))
 
 
 def test_parts_resume_and_processes_are_renewed(sealed, tmp_path):

@@ -11,28 +11,17 @@ from benchmarks.blind import make, refit, rows, score, truth
 from benchmarks.blind.outcome import Outcome, calibration_error, share_over, wilson
 from benchmarks.blind.plan import Case
 
+TRUTH = {"effective_modulus_MPa": 16000.0, "log_C1": 1.9}
+
 
 def outcome(kind, verdict, effects=(), hidden=(), *, key="k", status="ok", noise="clean", fault="", **more):
     """Hidden are (mechanism, lambda)."""
     case = {"kind": kind, "generator": "first", "noise": noise, "fault": fault, "particles": 20}
-    told = [{"mechanism": m, "formula": "f", "lambda": v, "lambda_residual": v} for m, v in hidden]
-    answer = {
-        "case": case,
-        "effects": told,
-        "points": 5000,
-        "particles": 20,
-        "correlation": more.pop("correlation", 0.1),
-    }
-    answer["truth"] = {"effective_modulus_MPa": 16000.0, "log_C1": 1.9}
-    found = discovery(verdict, effects, more.pop("sets", ()), **more)
-    result = {
-        "key": key,
-        "status": status,
-        "discovery": found if status == "ok" else None,
-        "wall_s": 2.0,
-        "cold": False,
-    }
-    return Outcome(key, answer, result)
+    true = [{"mechanism": m, "formula": "f", "lambda": v, "lambda_residual": v} for m, v in hidden]
+    answer = {"case": case, "effects": true, "points": 5000, "particles": 20, "truth": TRUTH}
+    answer["correlation"] = more.pop("correlation", 0.1)
+    found = discovery(verdict, effects, **more) if status == "ok" else None
+    return Outcome(key, answer, {"key": key, "status": status, "discovery": found, "wall_s": 2.0, "cold": False})
 
 
 def by_name(found):
@@ -50,19 +39,16 @@ def test_wilson_and_means_over_mechanisms():
 
 
 def test_singles():
-    found = by_name(
-        rows.singles(
-            [
-                outcome("single", "NAMED", [("creep", 0.9)], [("creep", 20.0)]),
-                outcome("single", "SET", [("creep", 0.6)], [("creep", 60.0)], sets=[["creep", "adhesion"]]),
-                outcome("single", "NAMED", [("creep", 0.9), ("adhesion", 0.5)], [("creep", 9.6)]),
-                outcome("single", "SET", [("damage", 0.5)], [("adhesion", 100.0)], sets=[["damage", "adhesion"]]),
-                outcome("single", "NO_GAP", (), [("adhesion", 5.0)]),
-                outcome("single", "NO_GAP", (), [("adhesion", 300.0)], status="crash"),
-            ]
-        )
-    )
-    # Creep: two of three right; adhesion: none of two (a crash is wrong); the weak one counts apart.
+    some = [
+        outcome("single", "NAMED", [("creep", 0.9)], [("creep", 20.0)]),
+        outcome("single", "SET", [("creep", 0.6)], [("creep", 60.0)], sets=[["creep", "adhesion"]]),
+        outcome("single", "NAMED", [("creep", 0.9), ("adhesion", 0.5)], [("creep", 9.6)]),
+        outcome("single", "SET", [("damage", 0.5)], [("adhesion", 100.0)], sets=[["damage", "adhesion"]]),
+        outcome("single", "NO_GAP", (), [("adhesion", 5.0)]),
+        outcome("single", "NO_GAP", (), [("adhesion", 300.0)], status="crash"),
+    ]
+    found = by_name(rows.singles(some))
+    # Creep: two of three right; adhesion: none of two (a crash is wrong); the weak one counts separately.
     row = found["right name alone, lambda >= 10"]
     assert (row.text, row.number, row.passed) == ("33.3 %", 5, False)
     assert found["right name alone, lambda >= 50"].text == "50.0 %"
@@ -74,16 +60,13 @@ def test_singles():
 
 def test_pairs():
     both = [("creep", 30.0), ("adhesion", 40.0)]
-    found = by_name(
-        rows.pairs(
-            [
-                outcome("pair", "NAMED", [("creep", 1), ("adhesion", 1)], both),
-                outcome("pair", "NAMED", [("creep", 1), ("damage", 1)], both),
-                outcome("pair", "NAMED", [("creep", 1)], both, correlation=-0.9),
-                outcome("pair", "NAMED", [("creep", 1)], [("creep", 30.0), ("adhesion", 5.0)]),
-            ]
-        )
-    )
+    some = [
+        outcome("pair", "NAMED", [("creep", 1), ("adhesion", 1)], both),
+        outcome("pair", "NAMED", [("creep", 1), ("damage", 1)], both),
+        outcome("pair", "NAMED", [("creep", 1)], both, correlation=-0.9),
+        outcome("pair", "NAMED", [("creep", 1)], [("creep", 30.0), ("adhesion", 5.0)]),
+    ]
+    found = by_name(rows.pairs(some))
     assert found["two effects, both named, lambda >= 20, correlation < 0.8"].text == "50.0 %"
     wrong = found["two effects, a wrong name, lambda >= 20, correlation < 0.8"]
     assert (wrong.text, wrong.number, wrong.passed) == ("50.0 %", 2, False)
@@ -98,43 +81,34 @@ def test_nulls_and_faults():
     low = by_name(rows.nulls([outcome("null", "NO_GAP", p_anything_missing=0.01 * k) for k in range(20)]))
     assert not low["bootstrap p values uniform (KS p)"].passed
     told = [{"check": "zero of force"}]
-    found = by_name(
-        rows.faults(
-            [
-                outcome("fault", "FIT_NOT_CONVERGED", fault="clipping", findings=told),
-                outcome("fault", "NO_GAP", fault="force_zero", findings=told),
-                outcome("fault", "NAMED", [("pop_in", 1)], fault="breakage"),
-            ]
-        )
-    )
+    some = [
+        outcome("fault", "FIT_NOT_CONVERGED", fault="clipping", findings=told),
+        outcome("fault", "NO_GAP", fault="force_zero", findings=told),
+        outcome("fault", "NAMED", [("pop_in", 1)], fault="breakage"),
+    ]
+    found = by_name(rows.faults(some))
     assert found["fault of the tester, no physics named"].text == "66.7 %"
     assert found["fault of the tester, told as what it is"].text == "33.3 %"
     assert found["  force_zero told"].text == "100.0 %"
 
 
-class Known:
-    """Truths worked out elsewhere."""
-
-    def curve_error(self, outcome):
-        return outcome.result["error"]
-
-    def held_by_places(self, outcome):
-        return outcome.result["held"], 0.25
-
-
 def test_unlisted_places_and_probabilities():
+    known = SimpleNamespace(
+        curve_error=lambda outcome: outcome.result["error"],
+        held_by_places=lambda outcome: (outcome.result["held"], 0.25),
+    )
     hidden = [("unlisted", 12.0)]
     said = [outcome("unlisted", "UNLISTED", (), hidden) for _ in range(3)]
     for one, error in zip(said, (0.05, 0.2, None), strict=True):
         one.result["error"] = error
     listed = [outcome("single", v, (), [("creep", 30.0)]) for v in ("UNLISTED", "NO_GAP")]
-    found = by_name(rows.unlisted([*said, outcome("unlisted", "NO_GAP", (), hidden)], listed, Known()))
+    found = by_name(rows.unlisted([*said, outcome("unlisted", "NO_GAP", (), hidden)], listed, known))
     assert found["UNLISTED said, residual lambda >= 10"].text == "75.0 %"
     assert found["UNLISTED said where a listed mechanism is true"].text == "50.0 %"
     assert found["curve within 10 % of its range, held out"].text == "50.0 %"
     for one, held in zip(listed, (0.71, 0.69), strict=True):
         one.result["held"] = held
-    found = by_name(rows.places(listed, Known()))
+    found = by_name(rows.places(listed, known))
     assert found["places hold >= 70 % of the difference, lambda >= 20"].text == "50.0 %"
     ranked = [{"mechanism": "creep", "probability": 0.5}, {"mechanism": "damage", "probability": 0.5}]
     one = outcome("single", "SET", [("creep", 0.5)], [("creep", 30.0)], sets=[["creep"]], ranking=ranked)
@@ -146,13 +120,9 @@ def test_unlisted_places_and_probabilities():
 
 def test_closing_and_running():
     def one(chi2, low, high, verdict="NAMED"):
-        estimate = {"interval_95": [low, high]}
-        peaks = {"interval_95": [high - 1000, high]}
-        after = {
-            "effective_modulus_MPa": estimate,
-            "modulus_at_peaks_MPa": peaks,
-            "log_C1": {"mean": {"interval_95": [1.8, 2.0]}},
-        }
+        intervals = {"effective_modulus_MPa": [low, high], "modulus_at_peaks_MPa": [high - 1000, high]}
+        after = {name: {"interval_95": ends} for name, ends in intervals.items()}
+        after["log_C1"] = {"mean": {"interval_95": [1.8, 2.0]}}
         gap = {"steps": [{"chi2_per_dof": 9.0}, {"chi2_per_dof": chi2}]}
         effects = [("creep", 1)] if verdict == "NAMED" else ()
         return outcome("single", verdict, effects, [("creep", 30.0)], key=str(chi2), gap=gap, parameters_after=after)
@@ -171,11 +141,9 @@ def test_closing_and_running():
 
 
 def test_places_are_segments_and_shares_of_load():
-    case = Case(1, "null", "first", (), "P1", 5, "clean")
-    _, drawn, _ = make.drawn(case, 5, 0)
+    _, drawn, _ = make.drawn(Case(1, "null", "first", (), "P1", 5, "clean"), 5, 0)
     every = truth.inside_places(drawn, [{"segment": "all", "load_fraction": [0.0, 1.0]}])
     assert every.all()
-    assert not truth.inside_places(drawn, []).any()
     up = truth.inside_places(drawn, [{"segment": "loading", "load_fraction": [0.5, 1.0]}])
     s = drawn.slices[0]
     share = drawn.force[s] / drawn.force[s].max()

@@ -2,20 +2,16 @@
 
 import functools
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from mcc_jax import Plastic
 from mcc_jax.calibrate import Model
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign, Curve
 from mcc_jax.discovery.base import base_fit
-from mcc_jax.simulate import (
-    Instrument,
-    Programme,
-    law_for_each,
-    paper_population,
-    read_effect,
-    simulate_campaign,
-)
+from mcc_jax.simulate import Instrument, Programme, law_for_each, paper_population, read_effect, simulate_campaign
 
 N, POINTS = 10, 150
 INSTRUMENT = Instrument(displacement_noise_um=0.05, force_noise_mN=0.02, zero_um=0.5)
@@ -24,9 +20,11 @@ FULL = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=30.0, poin
 
 SINGLE = Programme.cycles(points=POINTS)
 
+QUICK = {"confirm": False, "experiments": False, "posterior": False}
+
 
 def monotone_draws(seed, count):
-    """Draws of the paper's coefficients; some fall for a stretch and jump there: a test of theirs is another matter."""
+    """Draws of the paper's coefficients, without those whose law falls in part of its loading."""
     plastic = paper_population().sample(jax.random.key(seed), 4 * count)
     C = np.stack([np.asarray(plastic.C1), np.asarray(plastic.C3), np.asarray(plastic.C5)])
     smooth = np.flatnonzero(20 * C[0] * C[2] ** 5 > 1.2 * 9 * C[1] ** 6)[:count]
@@ -56,6 +54,15 @@ def campaign(*effects, seed=0, programme=FULL, particles=N, peaks_MPa=None, humi
     )
 
 
+def snapping():
+    """The third and the sixth of the laws fall in part of their loading: load control jumps over it."""
+    C = np.array([(4.0, 3.0, 2.4) if i in (2, 5) else (6.5, 3.0, 2.7) for i in range(N)])
+    plastic = eqx.filter_vmap(Plastic)(*map(jnp.asarray, (C * np.linspace(0.99, 1.01, N)[:, None]).T))
+    diameters = PAPER_DIAMETERS_UM[:N]
+    laws = law_for_each(plastic, 1.43, 16_000.0)
+    return simulate_campaign(laws, diameters, peaks_at(12, diameters), FULL, instrument=INSTRUMENT, seed=3)
+
+
 def subset(whole, chosen):
     """The same campaign with some of its particles."""
     return Campaign(
@@ -71,12 +78,6 @@ def with_curves(whole, change):
     """The same campaign with each curve's time, force and displacement changed."""
     curves = tuple(Curve(*change(c)) for c in whole.curves)
     return Campaign(whole.particles, whole.diameters_um, curves, whole.columns, whole.metadata)
-
-
-def mixed(one, other, from_other):
-    """The first campaign with some tests of the other."""
-    curves = tuple(other.curves[i] if i in from_other else c for i, c in enumerate(one.curves))
-    return Campaign(one.particles, one.diameters_um, curves, one.columns, one.metadata)
 
 
 cached = functools.cache(campaign)

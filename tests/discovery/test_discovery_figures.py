@@ -57,15 +57,12 @@ def test_what_is_left_is_less_with_the_effect_and_the_same_without(found):
     assert np.sum(nothing.white_before**2) / nothing.used.sum() == pytest.approx(1.0, abs=0.15)
 
 
-def test_map_has_every_kind_of_segment(found):
+def test_map_and_likeness_are_complete(found):
     places = found["frame"].places
     assert {place.segment for place in places} == {"loading", "hold", "unloading", "reloading"}
     assert sum(place.segment == "hold" for place in places) == 1
     assert np.nansum([place.share for place in places]) == pytest.approx(1)
     assert {place.sign for place in places} <= {-1, 0, 1}
-
-
-def test_likeness_is_a_correlation_with_the_set_first(found):
     names, both = found["frame"].likeness.names, found["frame"].likeness.correlation
     shared = {e["mechanism"] for e in found["frame"].ranking} - {"thermal_drift", "pop_in"}
     assert set(names) == shared  # what differs from test to test is like nothing that all share
@@ -75,15 +72,11 @@ def test_likeness_is_a_correlation_with_the_set_first(found):
     assert np.abs(both).max() <= 1 + 1e-9
 
 
-def test_ranking_tells_limits_and_what_is_untestable(found):
+def test_ranking_and_gap_show_limits_what_is_untestable_and_every_step(found):
     shown = texts(plot_ranking(found["frame"]))
-    for name in LIBRARY:
-        assert name.replace("_", " ") in shown
+    assert {name.replace("_", " ") for name in LIBRARY} <= set(shown)
     assert any(text.startswith("needs a column relative_humidity_percent") for text in shown)
     assert any("limit" in text and "um/mN" in text for text in shown)
-
-
-def test_gap_shows_every_step_and_the_floor(found):
     shown = texts(plot_gap(found["frame"]))
     assert "law alone" in shown
     assert f"+ {found['frame'].effects[0].mechanism.replace('_', ' ')}" in shown

@@ -5,13 +5,14 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from campaigns import base_of, cached
+from campaigns import base_of, cached, with_curves
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
 from mcc_jax import Model, log_evidence
+from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.calibrate.priors import SCALES, nuisance_moments
-from mcc_jax.discovery.design import ExtraColumns, between, design_of, moved
+from mcc_jax.discovery.design import ExtraColumns, design_of
 from mcc_jax.discovery.evidence import (
     LinearModel,
     amplitudes,
@@ -22,7 +23,7 @@ from mcc_jax.discovery.evidence import (
     value_and_gradient,
     whitened,
 )
-from mcc_jax.discovery.fit import fit_hypothesis
+from mcc_jax.discovery.fit import between, fit_hypothesis, moved, with_likely_noise
 from mcc_jax.discovery.settings import POPULATION
 from mcc_jax.effects import find_variant
 
@@ -90,7 +91,8 @@ def test_its_derivatives_are_those_of_differences(base, design):
     variants = find_variant("frame_compliance:linear"), find_variant("thermal_drift:linear")
     rng, mask = np.random.default_rng(1), np.asarray(base.tests.mask)
     basis = rng.normal(scale=0.1, size=(*mask.shape, 3)) * mask[..., None]
-    more = ExtraColumns(basis=basis, group=[1, 1, 2], sizes=[(-1.0, 1.0, np.inf), (-2.0, 0.8, np.inf)])
+    sizes = [(-1.0, 1.0, np.inf), (-2.0, 0.8, np.inf)]
+    more = ExtraColumns(misfits=(basis[..., :2], basis[..., 2:]), sizes=sizes)
     two = design_of(base, base.state.with_numbers(np.zeros(2)), variants, more)
     for one, hyper in ((design, base.hyperparameters), (two, np.append(base.hyperparameters, [-1.0, -2.0]))):
         value, slope = value_and_gradient(hyper, one)
@@ -101,8 +103,8 @@ def test_its_derivatives_are_those_of_differences(base, design):
 
 
 def test_columns_of_nothing_have_no_say(base, design):
-    """Room for a misfit that is not there: the same evidence, the same numbers."""
-    nothing = ExtraColumns(basis=np.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0, np.inf)])
+    """A misfit whose columns are zero: the same evidence, the same numbers."""
+    nothing = ExtraColumns(misfits=(np.zeros((*design.data.shape, 3)),), sizes=[(0.0, 1.0, np.inf)])
     roomy = design_of(base, base.state, (), nothing)
     one, other = optimise(design, base.hyperparameters), optimise(roomy, np.append(base.hyperparameters, 0.0))
     assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
@@ -152,3 +154,28 @@ def test_it_prefers_a_model_as_much_as_importance_sampling_does(base):
     frame = fit_hypothesis(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.hyper)
     assert frame.theta[0] == pytest.approx(COMPLIANCE, rel=0.1)
     assert frame.log_evidence - nothing.log_evidence == pytest.approx(found[1] - found[0], rel=0.1)
+
+
+WANDER_UM, LENGTH_S = 0.3, 25.0
+
+
+def wandering(whole, smooth, seed=3):
+    """The same tests with noise that is correlated in time, of one size in all of them."""
+    rng = np.random.default_rng(seed)
+
+    def noise(time_s):
+        x = np.abs(time_s[:, None] - time_s) / LENGTH_S
+        kernel = (1 + np.sqrt(3) * x) * np.exp(-np.sqrt(3) * x) if smooth else np.exp(-x)
+        return WANDER_UM * np.linalg.cholesky(kernel + 1e-9 * np.eye(len(x))) @ rng.standard_normal(len(x))
+
+    return with_curves(whole, lambda c: (c.time_s, c.force_mN, c.displacement_um + noise(c.time_s)))
+
+
+@pytest.mark.parametrize(("smooth", "correlation"), [(True, Correlation.MATERN_32), (False, Correlation.EXPONENTIAL)])
+def test_noise_that_wanders_in_time(smooth, correlation):
+    base, optimum = with_likely_noise(base_of(wandering(cached(seed=1), smooth)))
+    assert (base.model.correlation, base.model.along) == (correlation, Along.TIME)
+    wander, length = np.exp(optimum.hyper[2:4])
+    assert wander * np.median(base.scale) == pytest.approx(WANDER_UM, rel=0.3)
+    assert length == pytest.approx(LENGTH_S, rel=0.5)
+    assert np.std(np.log(base.scale)) < 0.1  # 0.2 to 0.3 under noise along the load

@@ -1,4 +1,4 @@
-"""A search over few mechanisms: posterior, sets, places, held-out gap, bootstrap."""
+"""A search over few mechanisms: posterior, sets, places, held-out gap, verify."""
 
 from dataclasses import replace
 
@@ -7,13 +7,10 @@ import pytest
 from campaigns import base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
-from mcc_jax.discovery import screen
-from mcc_jax.discovery.answer import _population, effects_of, instead_of, name_probabilities, sets_of
-from mcc_jax.discovery.bootstrap import p_anything
-from mcc_jax.discovery.candidates import untestable
+from mcc_jax.discovery import screen, verify
+from mcc_jax.discovery.answer import effects_of, instead_of, places, population_under, sets_of, where
 from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
 from mcc_jax.discovery.hypothesis import UNLISTED, Hypothesis
-from mcc_jax.discovery.locate import difference, places, where
 from mcc_jax.discovery.search import Search
 from mcc_jax.discovery.settings import DECISIONS, VERY_STRONG
 from mcc_jax.effects import LIBRARY
@@ -24,9 +21,8 @@ FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
 
 
 def search_of(campaign):
-    base = base_of(campaign)
-    library, _ = untestable(FEW, available_data(campaign))
-    return Search(base, library).run()
+    library, _ = screen.untestable(FEW, available_data(campaign))
+    return Search(base_of(campaign), library).run()
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +30,17 @@ def named():
     return search_of(cached("frame_compliance=0.004"))
 
 
-@pytest.fixture(scope="module")
-def nothing():
-    return search_of(cached(seed=1))
+@pytest.fixture
+def with_pair(named, monkeypatch):
+    """The same search with another hypothesis of the same evidence alone and with a misfit, added to what was found."""
+    kept = dict(named.found)
+
+    def add(names, value, **more):
+        one = Hypothesis(names, alone=value, with_misfit=value, **more)
+        monkeypatch.setattr(named, "found", {**kept, names: one})
+        return named
+
+    return add
 
 
 def test_a_hidden_effect_leads_and_its_probability_says_so(named):
@@ -47,11 +51,9 @@ def test_a_hidden_effect_leads_and_its_probability_says_so(named):
     assert named.found[("frame_compliance",)].at.theta[0] == pytest.approx(0.004, rel=0.1)
 
 
-def test_p_values_of_nothing_are_uniform(nothing, monkeypatch):
+def test_p_values_of_nothing_are_uniform(monkeypatch):
     """Scores drawn from the null law itself in place of the observed ones."""
-    from mcc_jax.discovery import bootstrap
-
-    plain = bootstrap._Statistic
+    nothing, plain = search_of(cached(seed=1)), verify._Statistic
     rng = np.random.default_rng(0)
 
     class Drawn(plain):
@@ -62,8 +64,8 @@ def test_p_values_of_nothing_are_uniform(nothing, monkeypatch):
             normal = rng.standard_normal(self.score.shape)
             self.score = np.einsum("ncd,nd->nc", root, normal)
 
-    monkeypatch.setattr(bootstrap, "_Statistic", Drawn)
-    p = np.array([p_anything(nothing, seed) for seed in range(30)])
+    monkeypatch.setattr(verify, "_Statistic", Drawn)
+    p = np.array([verify.p_anything(nothing, seed) for seed in range(30)])
     assert 0.3 < p.mean() < 0.7
     assert np.sum(p < 0.1) <= 8
 
@@ -73,73 +75,55 @@ def test_places_share_the_difference(named):
     mask = np.asarray(tests.mask)
     left = np.zeros(mask.shape)
     left[mask & (np.asarray(tests.record.kind) == 2)] = 1.0  # in holds alone
-    map_ = places(named.base, difference(left, None, mask))
-    told = where(named.base, map_)
-    assert [one["segment"] for one in told] == ["hold"]
-    assert told[0]["share"] == pytest.approx(1)
+    map_ = places(named.base, left)
+    (told,) = where(named.base, map_)
+    assert told["segment"] == "hold"
+    assert told["share"] == pytest.approx(1)
     assert sum(p.share for p in map_ if p.share == p.share) == pytest.approx(1)
 
 
-def test_two_names_must_lead_by_the_margin(named, monkeypatch):
+def test_two_names_must_lead_by_the_margin(named, with_pair):
     best = max(h.log_evidence for h in named.found.values())
     pair = ("damage", "frame_compliance")
-    kept = dict(named.found)
     for lead, there in ((0.5 * DECISIONS.margin, False), (3 * DECISIONS.margin, True)):
-        monkeypatch.setattr(
-            named, "found", {**kept, pair: Hypothesis(pair, alone=best + lead, with_misfit=best + lead)}
-        )
-        assert (pair in named.posterior()) is there
+        assert (pair in with_pair(pair, best + lead).posterior()) is there
 
 
 @pytest.mark.parametrize(("lead", "told"), [(0.0, False), (0.5, True), (3.0, False)])
-def test_two_names_short_of_the_margin_in_place_of_one_make_a_set(named, lead, told, monkeypatch):
-    """Below their prior odds they are not told; beyond the margin they are the answer themselves."""
-    kept = dict(named.found)
+def test_two_names_short_of_the_margin_in_place_of_one_make_a_set(named, lead, told, with_pair):
+    """Below their prior odds they are not reported; beyond the margin they are the answer themselves."""
     pair, leader = ("creep", "damage"), ("frame_compliance",)
-    best = max(named.log_posteriors().values())
-    level = best + DECISIONS.pair + lead * DECISIONS.margin  # one pair of two mechanisms has no further odds
-    if lead == 0:
-        level -= 2 * DECISIONS.pair
-    monkeypatch.setattr(named, "found", {**kept, pair: Hypothesis(pair, alone=level, with_misfit=level)})
+    level = max(named.log_posteriors().values()) + DECISIONS.pair + lead * DECISIONS.margin
+    with_pair(pair, level - (0 if lead else 2 * DECISIONS.pair))  # one pair of two mechanisms has no further odds
     winner = next(iter(named.log_posteriors()))
     assert winner == (pair if lead > 1 else leader)
-    assert instead_of(named, winner) == ((pair,) if told else ())
+    pairs = instead_of(named, winner)
+    assert pairs == ((pair,) if told else ())
     if winner == leader:
-        pairs = instead_of(named, leader)
-        (effect,) = effects = effects_of(named, leader, name_probabilities(named), 0.0)
+        (effect,) = effects = effects_of(named, leader, 0.0)
         (names,) = sets_of(named, leader, effects, pairs)
         assert names == ((*leader, *pair) if told else leader)
         assert (effect.probability > 0.9) is not told
 
 
-def test_a_second_name_has_an_amplitude_that_one_would_believe(named, monkeypatch):
-    best = max(h.log_evidence for h in named.found.values())
-    pair, kept = ("damage", "frame_compliance"), dict(named.found)
-    one = kept[("frame_compliance",)].at
-    first = max(pair, key=lambda n: kept[(n,)].log_evidence)
+def test_a_second_name_has_an_amplitude_that_one_would_believe(named, with_pair):
+    best, pair = max(h.log_evidence for h in named.found.values()), ("damage", "frame_compliance")
+    one = named.found[("frame_compliance",)].at
+    first = max(pair, key=lambda n: named.found[(n,)].log_evidence)
     variants = tuple(LIBRARY[n].variants[0] for n in pair)
     for beyond in pair:
         theta = np.array([(1.5 if n == beyond else 0.5) * v.plausible[1] for n, v in zip(pair, variants, strict=True)])
         formulas = replace(one, variants=variants, state=one.state.with_numbers(theta))
-        two = Hypothesis(pair, alone=best + 100, with_misfit=best + 100, at=formulas)
-        monkeypatch.setattr(named, "found", {**kept, pair: two})
-        assert (pair in named.posterior()) is (beyond == first)
-
-
-def test_what_no_mechanism_explains_has_prior_odds_of_its_own(named, monkeypatch):
-    kept = dict(named.found)
-    monkeypatch.setattr(named, "found", {n: replace(h, with_discrepancy=-np.inf) for n, h in kept.items()})
-    logs = named.log_posteriors()
-    assert logs[UNLISTED] == pytest.approx(kept[UNLISTED].log_evidence - DECISIONS.unlisted)
+        assert (pair in with_pair(pair, best + 100, at=formulas).posterior()) is (beyond == first)
 
 
 def test_a_name_with_a_discrepancy_counts_for_what_explains_more(named, monkeypatch):
-    kept = dict(named.found)
-    smooth = kept[UNLISTED].log_evidence
+    smooth = named.found[UNLISTED].log_evidence
+    others = {n: replace(h, with_discrepancy=-np.inf) for n, h in named.found.items()}
+    monkeypatch.setattr(named, "found", others)
+    assert named.log_posteriors()[UNLISTED] == pytest.approx(smooth - DECISIONS.unlisted)  # prior odds of its own
     for own, larger in ((smooth - 50, UNLISTED), (smooth + 50, ("damage",))):
-        damage = Hypothesis(("damage",), alone=own, with_misfit=own)
-        others = {n: replace(h, with_discrepancy=-np.inf) for n, h in kept.items()}
-        logs = []
+        damage, logs = Hypothesis(("damage",), alone=own, with_misfit=own), []
         for both in (-np.inf, smooth + 200):
             monkeypatch.setattr(named, "found", {**others, ("damage",): replace(damage, with_discrepancy=both)})
             logs.append(named.log_posteriors())
@@ -177,7 +161,7 @@ def test_formulas_of_the_modulus_agree_at_the_peaks():
     library = {"densification_stiffening": LIBRARY["densification_stiffening"]}
     search = Search(base_of(whole), library)
     search.fit_singles(["densification_stiffening"], 4)
-    each = [_population(search.base, r, r.optimum.hyper, r.design) for r in search.fits.values() if r.theta[0]]
+    each = [population_under(search.base, r, r.optimum.hyper, r.design) for r in search.fits.values() if r.theta[0]]
     extrapolated, at_peaks = (np.array([mean[j] for mean, _, _ in each]) for j in (1, 5))
     assert np.ptp(extrapolated) > 0.1
     assert np.ptp(at_peaks) < 0.03
@@ -189,44 +173,26 @@ def test_formulas_of_the_modulus_agree_at_the_peaks():
 
 def test_pairs_to_first_order_are_of_two_mechanisms(named, monkeypatch):
     a, b, value = named.screen.pairs()
-    mechanism = np.array([c.mechanism for c in named.screen.candidates])
-    few = np.unique(mechanism, return_counts=True)[1]
-    assert np.all(mechanism[a] != mechanism[b])
-    assert len(value) == np.prod(few)
+    mechanisms = named.screen.candidates.mechanisms
+    assert np.all(mechanisms[a] != mechanisms[b])
+    assert len(value) == np.prod(np.unique(mechanisms, return_counts=True)[1])
     # A second amplitude that explains nothing costs a little of the evidence that the first has alone.
-    alone, _ = named.screen.singles()
-    best = int(np.argmax(value))
-    assert alone.max() - 8 < value[best] < alone.max() + 8
+    alone, best = named.screen.singles().max(), int(np.argmax(value))
+    assert alone - 8 < value[best] < alone + 8
     assert named.leading_pairs() == {}
     monkeypatch.setattr("mcc_jax.discovery.search.DECISIONS", replace(DECISIONS, margin=-100.0))
     assert named.leading_pairs() == {("damage", "frame_compliance"): (a[best], b[best])}
 
 
-def test_what_tests_cannot_tell_is_compiled_but_not_searched(named, monkeypatch):
-    """Campaigns that can tell other formulas of one library trace its signatures once."""
-    traced = []
-    signatures = screen.signatures
-    monkeypatch.setattr(screen, "signatures", lambda *given: traced.append(1) or signatures(*given))
-    compliance = FEW["frame_compliance"]
-    fewer = {"frame_compliance": replace(compliance, variants=compliance.variants[1:])}
-    every, columns = screen.testable_columns(named.base, named.null.state, FEW, FEW)
-    some, fewer_columns = screen.testable_columns(named.base, named.null.state, FEW, fewer)
-    assert len(traced) <= 1
-    assert 0 < len(some) < len(every)
-    assert {c.variant.name for c in some} == {v.name for v in compliance.variants[1:]}
-    np.testing.assert_array_equal(fewer_columns, columns[..., [every.index(c) for c in some]])
-
-
 def test_a_discrepancy_begins_where_noise_leaves_it_most(named):
     """Fitted without it, correlated noise has swallowed a gap; what cannot come near another name is left."""
     r, of = named.null, named.discrepancy
-    start = np.append(r.optimum.hyper, [np.log(DECISIONS.general) + of.log_white - 1.0] * max(of.group))
+    start = np.append(r.optimum.hyper, [np.log(DECISIONS.general) + of.log_white - 1.0] * len(of.parts))
     design = of.added_to(named.base, r).design
     swallowed = np.where(np.arange(len(start)) == 2, start + 2.0, start)
     likely, _ = likely_start(design, swallowed)
     one, best = (optimise(design, begun, without=r.optimum) for begun in (swallowed, likely))
     assert best.log_joint > one.log_joint - 0.02 * len(start)  # as near as a mode is met (`FLAT`)
-    assert best.evaluations <= one.evaluations
     far = best.log_joint + VERY_STRONG + 10.0
     assert of.added_to(named.base, r, far) is None
     leader = replace(named.found[("frame_compliance",)], with_discrepancy=-np.inf)
