@@ -45,6 +45,10 @@ def is_found(protocol: Protocol, control: str | None) -> bool:
     )
 
 
+def assert_found(protocol: Protocol, control: str | None) -> None:
+    assert is_found(protocol, control)
+
+
 # Real instruments -----------------------------------------------------------------------------------------------------
 
 
@@ -143,7 +147,7 @@ def test_every_segment_is_found(case, known):
 )
 def test_clean_protocols_of_any_shape(seed, cycles, approach, holds, gaps, ramp):
     protocol = make_protocol(seed, cycles=cycles, noise=0.0, approach=approach, holds=holds, gaps=gaps, ramp=ramp)
-    assert is_found(protocol, "load")
+    assert_found(protocol, control="load")
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 1e4), (1e-3, -7.0)])
