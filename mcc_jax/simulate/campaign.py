@@ -230,7 +230,7 @@ def simulate_campaign(
         A campaign; the true coefficients, and whether each law is monotone, are in its `columns`.
 
     Raises:
-        InputError: for arguments that are unfit, or if the law refuses a particle (`RESULTS` says why).
+        InputError: if the law refuses a particle (`RESULTS` says why).
     """
     instrument = Instrument() if instrument is None else instrument
     seed = arguments.seed(seed)
@@ -346,8 +346,7 @@ def paper_campaign(
         unloading: form of the unloading law (16 GPa belongs to the printed one).
         strain_scaling: how the shape factor enters unloading.
         peak_stress_MPa: range of the maximum stress [MPa].
-        effects: what acts in addition to the law.
-        relative_humidity_percent: of the room during each test [%], shape (20,).
+        effects, relative_humidity_percent: as of `simulate_campaign`.
     """
     seed = arguments.seed(seed)
     programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme

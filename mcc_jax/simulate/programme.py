@@ -197,20 +197,7 @@ def _rounded(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def read_programme(file: str | Path) -> Programme:
-    """Read a programme from a TOML file.
-
-    ::
-
-        control = "load"            # or "displacement"
-        rate = 2.0                  # mN/s or um/s, for every ramp that names none
-        points = 300                # or: interval_s = 0.5
-        [[step]]
-        ramp_to = 1.0               # share of the particle's peak
-        [[step]]
-        hold_s = 60
-        [[step]]
-        ramp_to = 0.0
-        rate = 4.0
+    """Read a programme from a TOML file, as in the example of `mcc-jax simulate --help`.
 
     Raises:
         InputError: naming the file and the entry.
