@@ -94,7 +94,8 @@ class Blocks:
     def share(self, function: Callable[..., Any], particles: tuple[Any, ...], *shared: Any) -> Any:
         """The same, of all particles of this process in one call; for a function that cuts them into blocks itself."""
         rows = self._rows(self._own.ravel())
-        return self._gathered([function(*jax.tree.map(lambda x: np.asarray(x)[rows], particles), *shared)])
+        own = jax.tree.map(lambda x: np.asarray(x)[rows] if np.ndim(x) else x, particles)
+        return self._gathered([function(*own, *shared)])
 
     def keys(self, key: Any) -> np.ndarray:
         """Data of a random key for every block, for each of its particles."""

@@ -157,7 +157,8 @@ def test_blocks_make_up_the_whole():
         return {"matrix": own["matrix"] * own["number"] + shared, "first": own["matrix"][:, 0]}
 
     blocks = Blocks(6, 4)
-    for found, wanted in ((blocks.all(function, (tree,), 1.0), [4, 4]), (blocks.share(function, (tree,), 1.0), [8])):
+    for cut, wanted in ((blocks.all, [4, 4]), (blocks.share, [8])):
+        found = cut(function, (tree,), 1.0)
         assert sizes == wanted
         sizes.clear()
         np.testing.assert_array_equal(found["matrix"], 2 * tree["matrix"] + 1)
