@@ -18,7 +18,10 @@ Vector = Float[Array, " 3"]
 
 
 def _vector(value: Any) -> Vector:
-    return arguments.values(value, "a vector", shape="three numbers")
+    array = arguments.values(value, "a vector", shape="three numbers")
+    if array.shape[-1:] != (3,):
+        raise InputError(f"a vector has three components, got the shape {array.shape}")
+    return array
 
 
 def dot(one: Vector, other: Vector) -> Scalar:
