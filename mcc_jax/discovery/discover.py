@@ -82,6 +82,8 @@ def discover(
     campaign = check_tests(campaign)
     progress, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
+    for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
+        arguments.flag(value, name)
     known = dict(LIBRARY if library is None else library)
     for name in exclude:
         if name not in known:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -29,14 +30,14 @@ PUNCH_AREA = 1.43
 """c^2 of Storakers for perfect plasticity. It equals the paper's `a` by coincidence: never share one constant."""
 
 
-def _checked(name: str, **options: bool) -> Any:
-    """A field for a number of the law; a plain number out of its range is refused."""
+def _checked(name: str, **options: bool) -> Callable[[ScalarLike], Scalar]:
+    """The converter of a number of the law, which refuses a plain number out of its range."""
 
     def convert(value: ScalarLike) -> Scalar:
         positive(value, name, plain=True, **options)
         return scalar(value)
 
-    return eqx.field(converter=convert)
+    return convert
 
 
 class Plastic(eqx.Module):
@@ -56,9 +57,9 @@ class Plastic(eqx.Module):
         Bommireddy et al. (2018), eq. 16, where they are C1, C2, C3 in MPa, MPa^-3, MPa^-5.
     """
 
-    C1: Scalar = _checked("a plastic coefficient")
-    C3: Scalar = _checked("the softening coefficient C3", zero=True)
-    C5: Scalar = _checked("a plastic coefficient")
+    C1: Scalar = eqx.field(converter=_checked("a plastic coefficient"))
+    C3: Scalar = eqx.field(converter=_checked("the softening coefficient C3", zero=True))
+    C5: Scalar = eqx.field(converter=_checked("a plastic coefficient"))
 
     def __repr__(self) -> str:
         return f"Plastic(C1={value_of(self.C1)}, C3={value_of(self.C3)}, C5={value_of(self.C5)})"
@@ -175,7 +176,7 @@ class Formulas(eqx.Module):
 
     plastic: Plastic
     a: Scalar = eqx.field(converter=_shape)
-    effective_modulus: Scalar = _checked("the effective modulus [MPa]")
+    effective_modulus: Scalar = eqx.field(converter=_checked("the effective modulus [MPa]"))
     unloading: Unloading = eqx.field(
         static=True, converter=lambda value: member(value, Unloading, "unloading"), default=Unloading.PRINTED
     )
