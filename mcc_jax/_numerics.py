@@ -47,7 +47,7 @@ def forward_fill(values: Path, record: Bool[Array, " steps"]) -> Path:
     """
     steps = values.shape[0]
     held, since = jnp.where(record, values, 0.0), ~record
-    span = 1  # what has held for less than that is in place; `since` tells whether no record came for so long
+    span = 1  # what has held for less than that is in place; `since` says whether no record came for so long
     while span < steps:
         held = held + jnp.where(since, jnp.pad(held[:-span], (span, 0)), 0.0)
         since = since & jnp.pad(since[:-span], (span, 0))

@@ -137,7 +137,7 @@ def _as_input_error(directory: Path, error: BaseException) -> BaseException:
     why = error.strerror or str(error)
     if error.errno == errno.EISDIR:
         why = f"{Path(str(error.filename)).name} there is a folder, where a file is to be written"
-    remedy = "Make room and run again" if error.errno in _FULL else "Give a folder you may write to"
+    remedy = "Free some disk space and run again" if error.errno in _FULL else "Give a folder you may write to"
     return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
 
 

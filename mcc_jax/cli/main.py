@@ -89,7 +89,7 @@ def explain(error: BaseException, debug: bool) -> Stop:
         case MemoryError():
             problem = "there is not enough memory. Use fewer points or fewer particles."
         case OSError(errno=errno.ENOSPC | errno.EFBIG | errno.EDQUOT | errno.EIO):
-            problem = f"output cannot be written: {error.strerror}. Make room and run again."
+            problem = f"output cannot be written: {error.strerror}. Free some disk space and run again."
         case _:
             if debug:
                 click.echo("".join(traceback.format_exception(error)), err=True, nl=False)

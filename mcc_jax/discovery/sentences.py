@@ -77,7 +77,7 @@ def summary_of(found: Discovery) -> str:
     sentences += _gap(found.gap())
     if found.leads:
         each = [f"{plain(one['mechanism'])} ({max(100 * one['share'], 0.1):.2g} %)" for one in found.leads]
-        text = f"Beside it, a share of the evidence may be due to {listed(each, 'or')}; that is not added to the law."
+        text = f"In addition, a share of the evidence may be due to {listed(each, 'or')}; that is not added to the law."
         sentences.append(text)
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
         sentences.append(_modulus(found.parameters_before, found.parameters_after))
@@ -120,7 +120,7 @@ def _effect(effect: Effect, names: Sequence[str], pairs: Sequence[Sequence[str]]
     elif abs(effect.amplitude) > most:
         sentences.append(
             f"That is more than is plausible (at most {most:g}{unit}): something else may be in it, and the parameters "
-            "beside it are as doubtful."
+            "next to it are as doubtful."
         )
     paired = {name for pair in pairs for name in pair}
     rivals = [plain(n) for n in names if n != effect.mechanism and n not in paired]

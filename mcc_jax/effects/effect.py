@@ -33,7 +33,7 @@ class AbstractEffect(eqx.Module):
     differ in it alone are compiled once where many are derived together (`mcc_jax.law.signatures`).
 
     Attributes:
-        closed: whether all it does is a formula of particle and peak, without time, cycles or the room: `modify` of the
+        closed: whether all it does is a formula of particle and peak, without time, cycles or humidity: `modify` of the
             particle alone, or the `AbstractModulusAtPeak`. Energy, particle codes and exports to other engines take
             those only. Set it on the class.
         formulas: where the hooks of several formulas differ in one expression, these by name: functions of the effect

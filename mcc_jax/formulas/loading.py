@@ -138,7 +138,7 @@ def _start(curve: Quintic, target: Values, floor: Scalar) -> Values:
     E = _root(drop * over_H0)
     widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E * over_H0
 
-    # Around the bend, d^3 + 3 p d = 2 q. With K3 -> 0 there is no bend; the cubic then stands in for K5 x^5.
+    # Around the bend, d^3 + 3 p d = 2 q. With K3 -> 0 there is no bend; the cubic then replaces K5 x^5.
     over_K5 = recompute(1 / jnp.maximum(K5, tiny))
     bend_squared = 0.3 * K3 * over_K5
     bend = _root(bend_squared)

@@ -131,7 +131,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     .. math:: \gamma(F, t) = \gamma_{law}(F;\, \text{modified parameters}) + \sum_k \Delta_k(F, t),
 
     and displacement control solves it for the force. Amplitudes of zero change nothing. With effects, methods that
-    advance the law take times [s] as well; None stands for a test in which no time passes.
+    advance the law take times [s] as well; None means a test in which no time passes.
 
     Validity: the paper's tests ended at 7 to 16 MPa, :math:`\eta_p\epsilon \le 0.67` on the mean curve. If the quintic
     is not monotone, displacement control follows it down, load control snaps through. Value and first derivatives are

@@ -210,7 +210,7 @@ def empty(ax: Axes, text: str) -> None:
 
 
 def headroom(ax: Axes, share: float) -> None:
-    """Room above what is drawn for words."""
+    """Space for text above what is drawn."""
     low, high = ax.get_ylim()
     ax.set_ylim(low, high + share * (high - low))
 

@@ -92,16 +92,16 @@ def failing(error, folder):
 
 def test_the_users_folder_is_named_not_the_stage(tmp_path):
     def error(stage):
-        return InputError("cannot be written", file=stage.folder / "campaign", remedy="Make room")
+        return InputError("cannot be written", file=stage.folder / "campaign", remedy="Free some disk space")
 
     with pytest.raises(InputError) as caught:
         failing(error, tmp_path / "out")
-    assert str(caught.value) == f"{tmp_path / 'out'}: cannot be written. Make room"
+    assert str(caught.value) == f"{tmp_path / 'out'}: cannot be written. Free some disk space"
     assert snapshot(tmp_path) == {}
 
 
 def test_a_full_disk_is_bad_luck_and_an_error_of_another_file_is_not_ours(tmp_path):
-    with pytest.raises(InputError, match=r"No space left on device\. Make room"):
+    with pytest.raises(InputError, match=r"No space left on device\. Free some disk space"):
         failing(lambda _: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), tmp_path)
     with pytest.raises(FileNotFoundError):
         failing(lambda _: FileNotFoundError(errno.ENOENT, "no such file", "/somewhere/else"), tmp_path)
