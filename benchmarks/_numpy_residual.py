@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax.calibrate.hierarchical import LEAST_SPREAD
+from mcc_jax.calibrate.pooled_fit import LEAST_SPREAD
 
 FIELDS = ("D1", "D2", "D3")
 

@@ -9,7 +9,7 @@ from .data import select_tests as select_tests
 from .draws import Fit as Fit
 from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
-from .model import Model as Model
+from .numpyro_model import Model as Model
 from .paper import PaperCalibration as PaperCalibration
 from .paper import calibrate_paper as calibrate_paper
 from .paper_steps import fit_shape_parameter as fit_shape_parameter

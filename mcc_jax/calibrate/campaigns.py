@@ -22,7 +22,7 @@ from .fitting import checked_settings, prepare
 from .importance import smoothed
 from .judgement import numbers_in_reach
 from .least_squares import LeastSquares, least_squares
-from .model import Model
+from .numpyro_model import Model
 from .posterior import Posterior, sample
 
 if TYPE_CHECKING:

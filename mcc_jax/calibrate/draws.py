@@ -22,8 +22,8 @@ from .forward import Point
 from .importance import diagnostics, sample_weighted
 from .marginal import Marginal, ParticleDraw
 from .mode import LogPosterior, coordinate_names, handlers, log_densities, populations, seeded
-from .model import Model, coefficients
 from .noise import NoiseFit, Whitening, standard_promotion
+from .numpyro_model import Model, coefficients
 from .particle_fit import ParticleFits
 from .particles import ExactLikelihood, Length, are_many, corrected, some_of, weighted
 from .population import COEFFICIENTS, Population

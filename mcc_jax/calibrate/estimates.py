@@ -17,7 +17,7 @@ from ..campaign import Curve
 from ..effects import AbstractEffect, Variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 from .judgement import modulus_is_open
-from .model import Model
+from .numpyro_model import Model
 from .population import COEFFICIENTS
 
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))

@@ -21,7 +21,6 @@ from .forward import Linear, Point, linearise
 from .linearisation import Linearisation
 from .marginal import Summaries, summarise
 from .mode import LogPosterior, careful_enough, expect, log_densities, most_probable
-from .model import Model
 from .noise import (
     Noise,
     NoiseFit,
@@ -32,6 +31,7 @@ from .noise import (
     squared_innovations,
     student_weights,
 )
+from .numpyro_model import Model
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .population import Population
 from .priors import Priors, SpreadCoordinate, check_prior_of_a, population_sites

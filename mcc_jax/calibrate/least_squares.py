@@ -22,9 +22,9 @@ from .draws import Fit
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
 from .fitting import beyond_numbers, checked_settings, prepare
 from .forward import residuals
-from .hierarchical import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
 from .judgement import numbers_in_reach
-from .model import Model
+from .numpyro_model import Model
+from .pooled_fit import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
 from .population import COEFFICIENTS
 from .priors import SpreadCoordinate, nuisance_moments
 from .results import JointCalibration

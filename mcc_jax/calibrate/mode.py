@@ -19,8 +19,8 @@ from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 from .._types import Scalar
 from .compiling import compiled, side_by_side
 from .marginal import Marginal, straighten
-from .model import Model
 from .noise import standard_promotion
+from .numpyro_model import Model
 from .population import Population
 from .sharding import padded
 

@@ -22,7 +22,7 @@ from .estimates import effect_entries, finite, summary
 from .fitting import Start, checked_settings, prepare
 from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
 from .judgement import at_noise_level, numbers_in_reach
-from .model import Model
+from .numpyro_model import Model
 from .particles import Length
 from .population import COEFFICIENTS, Population
 from .predict import data_tree, predict_measured

@@ -22,8 +22,8 @@ from .compiling import compiled
 from .data import Tests
 from .draws import named_population
 from .estimates import summary
-from .model import Model
 from .noise import Whitening, forward_substitution
+from .numpyro_model import Model
 from .population import COEFFICIENTS, Population, flattened
 from .priors import population_sites
 from .results import PosteriorDraws

@@ -24,7 +24,7 @@ from .data import Selection, compared_rows, ranges_um, root_mean_squares
 from .draws import Fit, named_population
 from .estimates import estimate, finite, force_zero, law_of, log_estimate, quantities
 from .judgement import judged, misfit_note, noise_note, noise_share, unlike_others
-from .model import Model
+from .numpyro_model import Model
 from .population import COEFFICIENTS, Population
 
 if TYPE_CHECKING:

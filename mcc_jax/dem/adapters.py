@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._errors import InputError
-from .edges import Edges, list_edges, overlap_and_normal
+from .neighbours import Edges, list_edges, overlap_and_normal
 from .pair import HalfContact, largest_overlap, pair_energy, pair_force, sides_of
 
 

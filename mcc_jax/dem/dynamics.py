@@ -15,8 +15,8 @@ from jaxtyping import Array, Int
 from .. import arguments
 from .._format import described
 from .._numerics import recompute
-from .edges import stacked_lists, with_list
 from .forces import Forces, Motion, contact_forces
+from .neighbours import stacked_lists, with_list
 from .pair import wall_force, wall_recovery
 from .sharded import Contacts, Devices, gathered, sharded
 from .state import Packing, State, check_state, measured, rebuild_list

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._numerics import recompute
 from .._types import Flag, Scalar
-from .edges import Edges, pair_geometry
+from .neighbours import Edges, pair_geometry
 from .pair import HalfContact, largest_overlap, pair_energy, pair_force, sides_of, wall_energy, wall_force
 from .state import Packing, Vectors, WallHistory
 from .walls import Walls

@@ -14,7 +14,7 @@ from .. import arguments
 from .._format import described
 from .._numerics import recompute
 from .._types import Flag, Scalar, ScalarLike, scalar
-from .edges import Edges, overlap_and_normal
+from .neighbours import Edges, overlap_and_normal
 from .pair import HalfContact, largest_overlap, pair_force, wall_force
 from .state import Packing, State, Vectors, WallHistory
 from .walls import Vector, Wall, Walls, dot

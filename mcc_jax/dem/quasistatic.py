@@ -17,8 +17,8 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Scalar
-from .edges import Edges, pair_geometry, stacked_lists, with_list
 from .equilibrium import Equilibrium, Problem, find_equilibrium, force_on_walls, net_force, remembered
+from .neighbours import Edges, pair_geometry, stacked_lists, with_list
 from .state import Packing, State, Vectors, WallHistory, check_packing, check_state, measured, rebuild_list, start
 from .walls import Cylinder, Plane, Walls
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from .edges import PADDING, Edges, pad_rows
 from .forces import Forces, Motion, bodies_of, contact_forces, pair_loads, wall_loads
+from .neighbours import PADDING, Edges, pad_rows
 from .state import Packing, State, WallHistory
 
 AXIS = "shares"

@@ -21,7 +21,7 @@ from .._store import write_file
 from .._types import Scalar
 from ..geometry import Particle
 from ..law import MccLaw
-from .edges import Edges, carry_history, close_pairs, list_edges, pair_geometry
+from .neighbours import Edges, carry_history, close_pairs, list_edges, pair_geometry
 from .pair import HalfContact, half_contact, pair_split, passive, sides_of
 from .walls import Walls
 

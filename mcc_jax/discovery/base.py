@@ -18,7 +18,7 @@ from ..calibrate.data import Selection, Tests, ranges_um, root_mean_squares
 from ..calibrate.fitting import in_own_units, prepare
 from ..calibrate.forward import Forms, Point, snap
 from ..calibrate.judgement import numbers_in_reach
-from ..calibrate.model import Model
+from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..calibrate.sharding import Blocks
 from ..campaign import Campaign, find_segments

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, linearise
-from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation, Noise, whitening
+from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import nuisance_moments
 from ..effects import Variant
 from .base import Base, State

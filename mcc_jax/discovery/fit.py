@@ -15,8 +15,8 @@ from ..calibrate.data import ranges_um
 from ..calibrate.fitting import Start
 from ..calibrate.forward import Point
 from ..calibrate.judgement import LARGE_MISFIT
-from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation, Noise, particle_scales
+from ..calibrate.numpyro_model import Model
 from ..calibrate.population import Population
 from ..effects import Variant
 from .base import Base, State

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betaln, expit, logsumexp
 
-from ..calibrate.model import Model
+from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..effects import Variant
 from .base import Base, State

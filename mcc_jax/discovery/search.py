@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from .._types import Progress
 from ..calibrate.compiling import side_by_side
-from ..calibrate.model import Model
+from ..calibrate.numpyro_model import Model
 from ..campaign import Finding
 from ..effects import Mechanism, Variant
 from .base import Base

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator, Mapping
 
 from .._errors import InputError
-from . import contact, history, instrument, loading, material, unloading
+from . import contact, creep_and_cycles, instrument, loading, material, unloading
 from .variant import Mechanism, Variant
 
 
@@ -31,10 +31,10 @@ class _Library(Mapping[str, Mechanism]):
 
 
 LIBRARY: Mapping[str, Mechanism] = _Library(
-    instrument.FRAME, instrument.DRIFT, history.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE,
-    material.DENSIFICATION, history.HYSTERESIS, history.RATCHETING, loading.HARDENING, unloading.SHAPE_OF_UNLOADING,
-    material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION, contact.MISALIGNMENT,
-    instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
+    instrument.FRAME, instrument.DRIFT, creep_and_cycles.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE,
+    material.DENSIFICATION, creep_and_cycles.HYSTERESIS, creep_and_cycles.RATCHETING, loading.HARDENING,
+    unloading.SHAPE_OF_UNLOADING, material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION,
+    contact.MISALIGNMENT, instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
 )  # fmt: skip
 """The mechanisms known by name, in a fixed order."""
 

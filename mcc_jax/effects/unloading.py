@@ -10,8 +10,8 @@ import jax.numpy as jnp
 
 from .._types import Values
 from ..formulas import PUNCH_AREA, recovery, stress_ratio
+from .creep_and_cycles import NORM
 from .effect import AbstractEffect, pick
-from .history import NORM
 from .record import RELOAD, Context, contact_of, positive, reload_progress
 from .variant import Need, Nuisance, family, row
 

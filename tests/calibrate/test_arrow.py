@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax.calibrate.hierarchical import Parameters, minimise, normal_equations
+from mcc_jax.calibrate.pooled_fit import Parameters, minimise, normal_equations
 
 pytestmark = pytest.mark.extended
 

@@ -11,7 +11,7 @@ from joint_cases import NOISE, simulated, true_coefficients
 from scipy.optimize import least_squares as scipy_least_squares
 
 from mcc_jax import Curve, Programme, least_squares, paper_campaign
-from mcc_jax.calibrate.hierarchical import Parameters, pooled_residual, robust
+from mcc_jax.calibrate.pooled_fit import Parameters, pooled_residual, robust
 
 # Eight particles in every test: one compilation.
 KEEP = np.arange(20) < 8

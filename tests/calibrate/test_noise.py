@@ -13,7 +13,6 @@ from joint_cases import ELASTIC, KINDS, POINTS, dense, random_tests
 from scipy.stats import multivariate_normal
 
 from mcc_jax.calibrate.data import READING_UM
-from mcc_jax.calibrate.model import RecordNoise
 from mcc_jax.calibrate.noise import (
     Noise,
     Whitening,
@@ -22,6 +21,7 @@ from mcc_jax.calibrate.noise import (
     particle_scales,
     whitening,
 )
+from mcc_jax.calibrate.numpyro_model import RecordNoise
 from mcc_jax.calibrate.priors import NoisePrior
 
 FOUR = (0.2, 0.3, 0.5, 0.3)
