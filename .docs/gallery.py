@@ -201,7 +201,7 @@ CAUSES = {
     "contact": "Where particle and platen meet",
     "loading": "Of loading",
     "unloading": "Of unloading",
-    "history": "Of time and cycles",
+    "creep_and_cycles": "Of time and cycles",
     "material": "Of the particle and its material",
 }
 """What mechanisms have in common, by the module that holds them."""
