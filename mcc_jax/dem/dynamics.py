@@ -148,7 +148,8 @@ def advance(
     """Move on for a time, with a new list of edges whenever a particle has moved by half the skin.
 
     Args:
-        packing, motion: the spheres, and how they move.
+        packing: the spheres.
+        motion: how they move.
         state: where to start.
         velocity: of each wall [m/s].
         rows: how often something is measured.
@@ -204,7 +205,8 @@ def replay(
     rearrangements are chaotic (see `compact`).
 
     Args:
-        packing, motion: as in `advance`.
+        packing: as in `advance`.
+        motion: as in `advance`.
         state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
         tape: of one call of `advance`.
         devices: as in `run`.

@@ -155,7 +155,8 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
     onset of unloading the derivative is that of loading.
 
     Args:
-        i, j: the half contacts; exchanging them changes nothing but rounding.
+        i: one half contact.
+        j: the other; exchanging the two changes nothing but rounding.
         overlap_max: largest overlap before this one [m], 0 for a virgin contact.
         overlap: overlap now [m]; negative where the particles do not touch.
 

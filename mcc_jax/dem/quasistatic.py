@@ -158,7 +158,8 @@ def compact(
     as asked for (`spring`).
 
     Args:
-        packing, state: where to start (`relaxed`, `start`, or the end of another compaction or motion) in a `die`.
+        packing: the spheres.
+        state: where to start (`relaxed`, `start`, or the end of another compaction or motion) in a `die`.
         heights: of the top punch over the bottom one [m].
         solver: tolerances.
         tape: a list to which the load steps are appended, for `replay_compaction`.

@@ -144,7 +144,9 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
     """A state at rest: virgin contacts, a fresh list of edges.
 
     Args:
-        packing, walls, position: the spheres, the walls, and the centres [m].
+        packing: the spheres.
+        walls: the walls.
+        position: the centres [m].
         skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
         capacity: length of the list of edges; a tenth more than there are pairs if None.
 

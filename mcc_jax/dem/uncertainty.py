@@ -83,7 +83,9 @@ def punch_sensitivity(
     Args:
         packing_of: the packing as a function of parameters; at `values` the one that made the tape.
         values: parameters [any units].
-        state, tape, solver: start, load steps and solver of `compact`.
+        state: start of `compact`.
+        tape: its load steps.
+        solver: its solver.
     """
     values = jnp.asarray(values, float)
     last = np.array([step.last for step in tape])
@@ -338,7 +340,9 @@ def fit_compaction(
     Args:
         packing_of: the packing as a function of the parameters; traced by JAX.
         start: where to start.
-        state, heights, solver: as for `compact`.
+        state: as for `compact`.
+        heights: as for `compact`.
+        solver: as for `compact`.
         force: on the top punch at the heights [N].
         tolerance: of the parameters, relative and absolute.
 

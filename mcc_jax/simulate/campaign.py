@@ -346,7 +346,8 @@ def paper_campaign(
         unloading: form of the unloading law (16 GPa belongs to the printed one).
         strain_scaling: how the shape factor enters unloading.
         peak_stress_MPa: range of the maximum stress [MPa].
-        effects, relative_humidity_percent: as of `simulate_campaign`.
+        effects: as of `simulate_campaign`.
+        relative_humidity_percent: as of `simulate_campaign`.
     """
     seed = arguments.seed(seed)
     programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme
