@@ -6,8 +6,6 @@ from . import effects as effects
 from . import export as export
 from . import geometry as geometry
 from . import law as law
-from . import plots as plots
-from . import report as report
 from . import simulate as simulate
 from ._blocks import in_blocks as in_blocks
 from ._errors import InputError as InputError

@@ -286,7 +286,7 @@ def _sags(holds: list[Hold], force: Drive) -> bool:
         median(part[:third]) - median(part[-third:]) > max(6 * force.noise / np.sqrt(third), 0.2 * force.band)
         for part, third in parts
     ]
-    return 2 * sum(falls) > len(holds)
+    return bool(2 * sum(falls) > len(holds))
 
 
 def _contact_onset(force: Drive, displacement: np.ndarray) -> int:

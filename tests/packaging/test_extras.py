@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -97,10 +96,12 @@ def _report(_):
 
 
 def _write(folder):
+    from mcc_jax._store import Stage
     from mcc_jax.cli.calibrate import write_calibration
 
-    stage = SimpleNamespace(folder=folder, directory=folder, stale=[])
-    return write_calibration(object.__new__(mcc.Posterior), stage, origin={}, figures=False, progress=print)
+    return write_calibration(
+        object.__new__(mcc.Posterior), Stage(folder, folder), origin={}, figures=False, progress=print
+    )
 
 
 CALLS = {
