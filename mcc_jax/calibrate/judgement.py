@@ -52,7 +52,7 @@ def misfit_note(own_misfit: float) -> str | None:
     return (
         "even with its own C1, C3, C5 the law misses a test's displacements by "
         f"{100 * own_misfit:.0f} % of their range (median): "
-        "it describes these tests badly, or they are no compressions of single particles"
+        "either it describes these tests badly, or they are not compressions of single particles"
     )
 
 
@@ -107,7 +107,11 @@ def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray
     low, high = f"{times.min():.2g}", f"{times.max():.2g}"
     text = f"{named(which, len(names))}: the residual is {low if low == high else f'{low} to {high}'} times the others'"
     return Finding(
-        "unlike the others", "warning", text, "Look at the curve, and leave the particle out if it is no test", which
+        "unlike the others",
+        "warning",
+        text,
+        "Look at the curve, and leave the particle out if it is not a valid test",
+        which,
     )
 
 

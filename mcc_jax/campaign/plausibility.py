@@ -221,7 +221,7 @@ def _unit_finding(tests: _Tests, errors: Sequence[UnitError], odds: np.ndarray, 
         likely, remedy = f"{likely}, or {other}", f"{remedy}; or else {instead}"
     force, *lengths, _ = errors[first].decades
     if force > 0 and not any(lengths):
-        remedy += "; a material as soft as rubber would look the same, and is none that this law describes"
+        remedy += "; a material as soft as rubber would look the same, but this law does not describe such a material"
     names = tests.some(concerned)
     numbers = _typical(tests.numbers[concerned])
     it = apparent(numbers)
@@ -230,7 +230,7 @@ def _unit_finding(tests: _Tests, errors: Sequence[UnitError], odds: np.ndarray, 
     sizes = f"diameters of {_number(numbers[2:5].mean())} um"
     sentence = (
         f"{likely}: as given, {_who(names, 'the tests')} reach{'es' if len(names) == 1 else ''} {reached} and {sizes},"
-        f" which fits {'neither the others nor any' if names else 'no'} usual solid"
+        f" which matches {'neither the other tests nor any' if names else 'no'} common solid"
     )
     return _finding(sentence, remedy, names)
 
@@ -251,10 +251,10 @@ def _signs(tests: _Tests) -> list[Finding]:
         names = tests.some(real & turned)
         channels = [column.partition("_")[0] for column in columns]
         what = f"{' and '.join(f'{channel}s' for channel in channels)} of {_who(names)}"
-        remedy = f"turn the sign of {' and '.join(columns)} in curves.csv, or write sign = -1 for"
+        remedy = f"reverse the sign of {' and '.join(columns)} in curves.csv, or write sign = -1 for"
         found.append(
             _finding(
-                f"the {what} seem to have the wrong sign: {seen}, and compression counts positive here",
+                f"the {what} seem to have the wrong sign: {seen}, and compression is positive here",
                 f"{remedy} {' and '.join(channels)} in the mapping file",
                 names,
             )
@@ -291,7 +291,7 @@ def _order_of_diameters(diameters_um: np.ndarray) -> list[Finding]:
         return []
     smallest, other = (ranks == 0).sum(axis=0), f"D{best + 1}"
     sentence = (
-        f"the diameters {other} and D3 seem to be swapped: {other} is the smallest of {smallest[best]} of"
+        f"the diameters {other} and D3 seem to be swapped: {other} is the smallest diameter in {smallest[best]} of"
         f" {len(sizes)} particles and D3 of {smallest[2]}, and particles rest on their flat side"
     )
     exchange = f"exchange {other}_um and D3_um in particles.csv, unless the particles stood upright"
@@ -336,7 +336,7 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
         own = f"with about {_modulus(it.modulus_MPa)} by the slope of unloading"
     sentence = (
         f"The fitted modulus of {modulus_MPa / 1e3:.3g} GPa is outside the range of any solid ({low / 1e3:g} to"
-        f" {high / 1e3:g} GPa), though the tests are those of an ordinary one, {own}"
+        f" {high / 1e3:g} GPa), although the tests look like those of an ordinary solid, {own}"
     )
     remedy = "Do not use it: the fitted form of unloading is not that of these tests; another form may be"
     return [Finding("fitted modulus", "error", sentence, remedy)]

@@ -50,7 +50,7 @@ SPIKES = Finding(
 STUCK = Finding(
     "stuck readings",
     "info",
-    "{} readings of CHANNEL repeat the one before while the test goes on, and are left out",
+    "{} readings of CHANNEL repeat the previous reading while the test continues, and are left out",
     "Look for a loose cable or a full buffer of the logger",
     code="stuck",
 )
@@ -65,13 +65,13 @@ BROKE = Finding(
     "breakage",
     "warning",
     "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there",
-    "Load particles of this batch less, or leave this one out",
+    "Use a lower maximum load for this batch, or leave this particle out",
     code="broke",
 )
 GIVES_WAY = Finding(
     "breakage",
     "info",
-    "force falls from {} mN on while the platens keep closing (the particle gives way or slips): {} readings are left "
+    "force falls after {} mN while the platens keep closing (the particle gives way or slips): {} readings are left "
     "out",
     "Check whether the particle has broken; if so, load it less",
     code="gives way",

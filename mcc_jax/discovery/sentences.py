@@ -40,7 +40,7 @@ def verdict_in_words(content: Mapping[str, Any]) -> str:
 def headline(content: Mapping[str, Any], tests: str = "tests") -> str:
     """The answer of a `discovery.json` in one sentence; `tests` is what the tests are called."""
     if content["verdict"] == "NO_GAP":
-        return "Nothing is missing in the law that these tests could show."
+        return "As far as these tests can show, nothing is missing from the law."
     if content["verdict"] == "FIT_NOT_CONVERGED":
         return "The law could not be fitted well enough to ask what it lacks."
     closed = within_noise(content["gap"])
@@ -60,9 +60,9 @@ def taken_back(names: Sequence[str], objection: str) -> str:
     most = listed(list(map(plain, names))) if names else "a formula of its own"
     return (
         f"The law does not describe these tests, and nothing was found that does. What explains most is {most}, but "
-        f"of particles that took no part {objection}. Look at the tests one by one: records that run on through slips "
-        "or breakage, particles of several kinds, or another material than the law was made for would do this; leave "
-        "out what is no test of one particle, and discover again."
+        f"it fails on held-out particles: {objection}. Inspect the tests one by one: records that continue through "
+        "slip or breakage, particles of several kinds, or a material other than the one the law was made for could "
+        "cause this. Leave out any record that is not a test of a single particle, and run discover again."
     )
 
 
@@ -93,9 +93,8 @@ def _verdict(found: Discovery) -> str:
     count = len(found.base.selection.kept) if found.base is not None else 0
     chance = f"probability of so much evidence by chance: {found.p_any:.2g}"
     if found.verdict == "NO_GAP":
-        return (
-            f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
-        )
+        agree = f"The law and the {count} tests agree within the noise"
+        return f"{agree}; as far as they can show, nothing is missing ({chance})."
     place = ""
     if found.where:
         first = found.where[0]
@@ -162,12 +161,12 @@ def next_tests(experiments: Sequence[Mapping[str, Any]], checks: Sequence[Mappin
         best = experiments[0]
         sure = best["power"] >= ENOUGH
         names = listed([plain(n) for n in best["separates"]], "or")
-        doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
+        doubt = "" if sure else f"None of the further tests considered would reliably separate {names}. "
         sentences.append(
             f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles; "
             f"with these it would separate {names} with probability {best['power']:.2f}."
         )
     if checks and not sure:
         each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in checks[:CHECKS])
-        sentences.append(f"Each would show by itself ({each}).")
+        sentences.append(f"Each mechanism can be checked directly ({each}).")
     return sentences

@@ -100,7 +100,7 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
         known = [
             f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
             for name, key, factor, unit in (
-                ("the shape parameter a, how much more flat particles are strained than spheres,", "a", 1.0, ""),
+                ("the shape parameter a, how much more a flat particle is strained than a sphere,", "a", 1.0, ""),
                 ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
             )
             if content[key]["interval_95"] is not None
@@ -163,7 +163,7 @@ def _after(found: dict[str, Any], *, added: bool) -> list[tuple[str, str]]:
         return [(" ".join(separating), "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
         if added:
-            return [("Use the law together with what was added: the parameters below are of both.", "")]
+            return [("Use the law together with the added effects; the parameters below include them.", "")]
         use = "Use the law together with what was added (parameters “after” below), not alone"
         command = calibration_with_found(found, "CAMPAIGN")
         return [(f"{use}. All about it, from every particle's curve to the checks:" if command else f"{use}.", command)]
@@ -177,7 +177,7 @@ def spread(log: dict[str, Any]) -> str:
     """How much particles differ in a coefficient, in words: of mean and standard deviation of its logarithm."""
     mean, sd = log["mean"]["value"], log["sd"]["value"]
     if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
-        return "How much particles differ; these data do not show it."
+        return "How much particles differ: not determined by these data."
     if sd < 1e-3:
         return "How much particles differ: hardly at all in these data."
     low, high = number(math.exp(mean - sd), 3), number(math.exp(mean + sd), 3)

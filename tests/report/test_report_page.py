@@ -193,7 +193,7 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("NO_GAP", "Nothing is missing in the law"),
+        ("NO_GAP", "nothing is missing from the law"),
         ("NAMED", "The law misses frame compliance"),
         ("SET", "or what looks like it"),
         ("UNLISTED", "no listed mechanism explains"),
