@@ -8,9 +8,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import arguments
+from .._errors import InputError
 from .._format import described
 from .._numerics import recompute
 from .._types import Flag, Scalar, ScalarLike, scalar
@@ -74,7 +76,11 @@ class Motion(eqx.Module):
         """From plain numbers, in double precision."""
         time_step = arguments.number(time_step, "the time step [s], see `stable_time_step`,", above=0)
         drag = arguments.number(drag, "drag [1/s]", least=0)
-        step, resistance, weight = (jnp.asarray(x, float) for x in (time_step, drag, gravity))
+        acceleration = arguments.floats(gravity, "gravity", shape="three components [m/s^2]")
+        # A single number would act along all three axes.
+        if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
+            raise InputError(f"gravity must be three finite components [m/s^2], got {arguments.shown(gravity)}")
+        step, resistance, weight = (jnp.asarray(x, float) for x in (time_step, drag, acceleration))
         return cls(step, interaction or Interaction(), resistance, weight)
 
 

@@ -34,7 +34,8 @@ class HalfContact(Contact):
     r"""Half of a plate test: force against the compression d of one side of a particle, towards a rigid flat.
 
     A `formulas.Contact` in metres and newtons. A particle between two plates is two half contacts in series, each
-    compressed by half the platen displacement. Make many with ``jax.vmap(half_contact)``, pick with `sides_of`.
+    compressed by half the platen displacement. Make many with ``equinox.filter_vmap(half_contact)``, pick with
+    `sides_of`.
 
     Attributes:
         k1, k3, k5: initial stiffness [N/m], softening [N/m^3], hardening [N/m^5].

@@ -50,7 +50,7 @@ MEANINGS = {
     "Fast mode is accurate (Pareto k)": "How well the quadratic summaries of the fast mode approximate the tests "
     "themselves. If not: --mode joint.",
     "The law's form fits": "Median misfit with each particle's own coefficients, as a share of its range of "
-    "displacement. If large: these may be no compressions of single particles, or the diameters are wrong.",
+    "displacement. If large: these may not be compressions of single particles, or the diameters are wrong.",
     "What is left is noise": "Share of what is left that is correlated along a test. A large one is not noise of the "
     "instrument but something that the law misses, and the stated errors are those of a law that misses it.",
     "New particles behave": "Share of particles drawn from this population whose loading curve would fall somewhere.",

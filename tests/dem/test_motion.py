@@ -330,6 +330,12 @@ def test_a_run_takes_the_steps_asked_for():
 
 
 @pytest.mark.extended
+@pytest.mark.parametrize("gravity", [-9.81, (0.0, -9.81), (0.0, 0.0, float("nan"))])
+def test_gravity_is_three_finite_components(gravity):
+    with pytest.raises(InputError, match="gravity.*three"):
+        Motion.of(1e-8, gravity=gravity)
+
+
 def test_scattered_spheres_do_not_touch():
     pack = packing()
     position, height = scattered(jax.random.key(4), pack.radius, DIE_RADIUS)
