@@ -330,9 +330,9 @@ def test_a_run_takes_the_steps_asked_for():
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("gravity", [-9.81, (0.0, -9.81), (0.0, 0.0, float("nan"))])
+@pytest.mark.parametrize("gravity", [(-9.81,), (0.0, -9.81), (0.0, 0.0, float("nan"))])
 def test_gravity_is_three_finite_components(gravity):
-    with pytest.raises(InputError, match="gravity.*three"):
+    with pytest.raises(InputError, match="three finite components"):
         Motion.of(1e-8, gravity=gravity)
 
 
