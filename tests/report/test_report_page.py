@@ -271,7 +271,7 @@ def test_a_gap_is_called_closed_only_where_chi2_says_so(chi2, words):
     assert words in headline(content)
 
 
-@pytest.mark.parametrize(("power", "words"), [(0.95, "Next: a hold"), (0.3, "would surely separate")])
+@pytest.mark.parametrize(("power", "words"), [(0.95, "Next: a hold"), (0.3, "would reliably separate")])
 def test_an_experiment_that_may_not_separate_is_not_simply_recommended(folder, power, words):
     keep(folder, "discovery")
     one = {"experiment": "a hold of 60 s at the largest load", "separates": ["frame_compliance", "creep"]}
