@@ -290,7 +290,7 @@ def test_what_would_show_each_candidate_by_itself_is_there(folder):
     text = text_of(changed(folder, "discovery.msgpack", verdict="SET", next_experiments=[], checks=checks))
     assert "None is proposed" in text
     assert "(frame compliance: press the bare platen; platen sink in: repeat on diamond)" in text
-    assert "by itself" not in text_of(changed(folder, "discovery.msgpack", checks=[]))
+    assert "checked directly" not in text_of(changed(folder, "discovery.msgpack", checks=[]))
 
 
 def test_equal_input_gives_an_equal_page(complete, page):
