@@ -61,7 +61,7 @@ SEALED = {
     "right name alone": "right name alone, lambda >= 10",
     "both named": "two effects, both named, lambda >= 20, correlation < 0.8",
     "false alarm": "alarm, nothing hidden",
-    "on no list": "UNLISTED said, residual lambda >= 10",
+    "outside the library": "UNLISTED said, residual lambda >= 10",
     "true modulus": "effective_modulus_MPa within its 95 % interval",
 }
 """Rows of the table of sealed campaigns, by words of README."""
