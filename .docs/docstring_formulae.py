@@ -1,4 +1,4 @@
-"""Docstrings write formulae in the way of Sphinx; Markdown wants them between dollars."""
+"""Docstrings as the pages need them: formulae between dollars instead of Sphinx's way, one entry for each name."""
 
 import re
 import textwrap
@@ -8,10 +8,12 @@ import griffe
 _BLOCK = re.compile(r"^(?P<indent>[ ]*)\.\. math::[ ]*(?P<first>.*)\n(?P<rest>(?:(?P=indent)[ ]+\S.*\n|[ ]*\n)*)", re.M)
 _INLINE = re.compile(r":math:`([^`]+)`")
 _LITERAL = re.compile(r"(?<=\w)::$", re.M)
+_SECTION = re.compile(r"^(?:Args|Attributes):\n(?:(?:[ ]+\S.*)?\n)*", re.M)
+_ENTRY = re.compile(r"^(?P<indent>[ ]+)(?P<names>\w+(?:, \w+)+)(?P<text>: .*\n(?:(?P=indent)[ ]+\S.*\n)*)", re.M)
 
 
 def in_markdown(text: str) -> str:
-    """A docstring with its formulae between dollars, each block a paragraph."""
+    """A docstring with its formulae between dollars, each block a paragraph, and with each argument on its own."""
 
     def block(match):
         indent = match["indent"]
@@ -19,7 +21,11 @@ def in_markdown(text: str) -> str:
         formula = " ".join(f"{match['first']} {lines}".split())
         return f"\n{indent}$$\n{indent}{formula}\n{indent}$$\n\n"
 
+    def entries(match):
+        return "".join(f"{match['indent']}{name}{match['text']}" for name in match["names"].split(", "))
+
     text = _BLOCK.sub(block, text + "\n")
+    text = _SECTION.sub(lambda section: _ENTRY.sub(entries, section[0]), text)
     return _LITERAL.sub(":", _INLINE.sub(lambda m: f"${' '.join(m[1].split())}$", text)).rstrip()
 
 

@@ -1,4 +1,4 @@
-"""Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover, embed.
+"""Loading-unloading contact law of microcrystalline cellulose particles: simulate, calibrate, discover, embed.
 
 Everything public is here or in `mcc_jax.law`, `mcc_jax.campaign`, `mcc_jax.effects`, `mcc_jax.simulate`,
 `mcc_jax.calibrate`, `mcc_jax.discovery`, `mcc_jax.dem`, `mcc_jax.export`, `mcc_jax.plots` and `mcc_jax.report`.

@@ -102,7 +102,7 @@ def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
 
 OWN_UNITS = (
     "Priors are in this campaign's own units, {:.3g} MPa at a scaled strain of {:.2g}, not in those of "
-    "micro-crystalline cellulose"
+    "microcrystalline cellulose"
 )
 
 

@@ -149,7 +149,7 @@ class Priors:
 
     @classmethod
     def of_scale(cls, stress_MPa: float, strain: float, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
-        r"""Priors in a campaign's own stress and strain, for a material that is not like micro-crystalline cellulose.
+        r"""Priors in a campaign's own stress and strain, for a material that is not like microcrystalline cellulose.
 
         Under a change of units of stress and strain the coefficients go as :math:`C_1 \sim \sigma/\epsilon`,
         :math:`C_5 \sim \sigma^{1/5}/\epsilon` and the modulus as :math:`\sigma/\epsilon^3` (printed form) or

@@ -65,7 +65,7 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
 
     Returns:
         Findings: "error" for a likely error, with the column and the remedy, and for numbers that no solid has; "info"
-        where the material is not like micro-crystalline cellulose, which is no fault. What concerns a fitted modulus is
+        where the material is not like microcrystalline cellulose, which is no fault. What concerns a fitted modulus is
         of the check "fitted modulus" and points to no unit; all else is of the check "plausibility".
         `Finding.particles` names the particles where not all are concerned.
     """
@@ -80,7 +80,7 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
 
 
 class Material(NamedTuple):
-    """Another material than micro-crystalline cellulose: median peak stress, strain there times the paper's shape
+    """Another material than microcrystalline cellulose: median peak stress, strain there times the paper's shape
     factor, and a remark that it is stiffer or softer."""
 
     stress_MPa: float
@@ -90,7 +90,7 @@ class Material(NamedTuple):
 
 @np.errstate(all="ignore")
 def other_material(campaign: Campaign) -> Material | None:
-    """The material of the tests; None if they are like micro-crystalline cellulose, or a wrong unit or sign is more
+    """The material of the tests; None if they are like microcrystalline cellulose, or a wrong unit or sign is more
     likely."""
     tests = _tests(check_campaign(campaign))
     return None if not tests.names or worst(tests.findings) == "error" else _material(tests)
@@ -343,7 +343,7 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
 
 
 def _material(tests: _Tests) -> Material | None:
-    """The material of the tests if it is not like micro-crystalline cellulose, which is no fault."""
+    """The material of the tests if it is not like microcrystalline cellulose, which is no fault."""
     D1, D2, D3 = tests.diameters_um.T
     it = apparent(tests.numbers)
     x = (1 + PAPER_SHAPE_PARAMETER * (1 - D3**2 / (D1 * D2))) * 10**it.strain
@@ -355,7 +355,7 @@ def _material(tests: _Tests) -> Material | None:
     stress, strain = _median(it.stress_MPa), _median(it.strain)
     remark = (
         f"the material is {_number(abs(ratio))} times {'stiffer' if ratio > 0 else 'softer'} in loading than"
-        f" micro-crystalline cellulose (Avicel PH-200): {_number(stress)} MPa at a strain of {_number(strain)}; a"
+        f" microcrystalline cellulose (Avicel PH-200): {_number(stress)} MPa at a strain of {_number(strain)}; a"
         " typical solid otherwise"
     )
     return Material(float(10**stress), float(np.nanmedian(x)), _finding(remark, "", level="info"))

@@ -134,7 +134,7 @@ class OneLineGroup(click.Group):
 @click.version_option(package_name="mcc_jax", message="%(prog)s %(version)s", help="Show the version.")
 @click.pass_context
 def cli(ctx: click.Context, debug: bool) -> None:
-    """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover, report."""
+    """Loading-unloading contact law of microcrystalline cellulose particles: simulate, calibrate, discover, report."""
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
 

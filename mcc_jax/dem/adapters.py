@@ -61,7 +61,7 @@ def jaxdem_force_model(sides: HalfContact) -> Any:
     @jax.tree_util.register_dataclass
     @dataclasses.dataclass
     class MccForce(ForceModel):
-        """Loading and unloading of micro-crystalline cellulose, one half contact a particle."""
+        """Loading and unloading of microcrystalline cellulose, one half contact a particle."""
 
         sides: HalfContact | None = None
 

@@ -26,7 +26,7 @@ from .pair import HalfContact, half_contact, pair_split, passive, sides_of
 from .walls import Walls
 
 MCC_DENSITY = 1540.0
-"""True density of micro-crystalline cellulose, about [kg/m^3]."""
+"""True density of microcrystalline cellulose, about [kg/m^3]."""
 SPARE = 1.1
 """Length of a new list of edges over the pairs found."""
 

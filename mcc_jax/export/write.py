@@ -71,7 +71,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
     return {
         "schema": 1,
-        "what": "loading-unloading contact law of micro-crystalline cellulose particles",
+        "what": "loading-unloading contact law of microcrystalline cellulose particles",
         "coefficients_of": "the population: exp(mean of log C)" if origin.particle is None else origin.particle,
         "law": form,
         "parameters": parameters,

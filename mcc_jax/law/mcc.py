@@ -1,4 +1,4 @@
-"""The loading-unloading contact law of micro-crystalline cellulose particles, with the effects it may have."""
+"""The loading-unloading contact law of microcrystalline cellulose particles, with the effects it may have."""
 
 from __future__ import annotations
 
