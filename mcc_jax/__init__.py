@@ -9,7 +9,7 @@ Switch JAX to double precision first, unless you mean single:
 
 import lazy_loader as _lazy
 
-__version__ = "0.1.0"
+from ._version import __version__ as __version__
 
 # The public names are in `__init__.pyi`, one by one, and are loaded at first use: `mcc-jax --help` has answered
 # before JAX could be imported.

@@ -1,8 +1,7 @@
 """Typed values as bytes and back, to the last bit: dataclasses, modules, arrays, enums; never code (no pickle).
 
 A value is written as MessagePack. Arrays keep dtype, shape and bytes; an object is the name of its class, its fields
-(but for those whose metadata say `archived=False`: working arrays, which are None when read) and
-the cached properties that its class lists in `archived`, and is built again without running any of its code. Only
+and the cached properties that its class lists in `archived`, and is built again without running any of its code. Only
 classes of this package are built, and those of `FOREIGN`.
 """
 
@@ -14,7 +13,7 @@ import hashlib
 import importlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +21,17 @@ import msgspec
 import numpy as np
 
 from ._errors import InputError
-from ._extras import own_version
+from ._version import __version__
 from .files import POSTERIOR_BYTES, read_regular
 
-FORMAT, VERSION = "mcc_jax result", 1
+VERSION = 1  # of the format
 AGAIN = "Write it again with the command or function that made it, or move it away."
 FOREIGN = ("tinygp.kernels.quasisep", "tinygp.solvers.quasisep")
 _PLAIN = (bool, int, float, str, bytes, type(None))
 
 
 class _Archive(msgspec.Struct):
-    """The contents of a file."""
-
-    format: str
+    format: Literal["mcc_jax result"]
     version: int
     written_by: str
     sha256: str
@@ -42,28 +39,19 @@ class _Archive(msgspec.Struct):
 
 
 def encode(value: Any) -> bytes:
-    """The bytes of a file that holds a value.
-
-    Raises `InputError` naming a part that cannot be written, such as an effect of a class of one's own.
-    """
+    """The bytes of a file that holds a value; `InputError` names a part that cannot be written."""
     content = msgspec.msgpack.encode(_plain(value, "result"))
     digest = hashlib.sha256(content).hexdigest()
-    return msgspec.msgpack.encode(_Archive(FORMAT, VERSION, own_version(), digest, content))
+    return msgspec.msgpack.encode(_Archive("mcc_jax result", VERSION, __version__, digest, content))
 
 
 def read_archive(file: Path) -> Any:
-    """The value that a file holds.
-
-    Raises `InputError` if it is missing, cut off, changed, of a newer version, or something else.
-    """
+    """The value that a file holds; `InputError` if it is missing, cut off, changed or of a newer version."""
     raw = read_regular(file, POSTERIOR_BYTES, AGAIN)
     try:
         archive = msgspec.msgpack.decode(raw, type=_Archive)
-        known = archive.format == FORMAT
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"is no result of mcc_jax, or is cut off: {error}", file=file, remedy=AGAIN) from None
-    if not known:
-        raise InputError(f"is something else, {archive.format[:60]!r}", file=file, remedy=AGAIN)
     if archive.version > VERSION:
         remedy = f"Install mcc_jax {archive.written_by[:40]} or newer."
         raise InputError(f"was written by a newer version, {archive.written_by[:40]}", file=file, remedy=remedy)
@@ -95,11 +83,13 @@ def _plain(value: Any, where: str) -> Any:
     if isinstance(value, type):
         return {"class": _name(value, where)}
     if dataclasses.is_dataclass(value):
-        names = [f.name for f in dataclasses.fields(value) if f.metadata.get("archived", True)]
-        names += getattr(value, "archived", ())
-        fields = {name: _plain(getattr(value, name), f"{where}.{name}") for name in names if hasattr(value, name)}
+        fields = {name: _plain(getattr(value, name), f"{where}.{name}") for name in _contents(type(value))}
         return {"object": _name(type(value), where), "fields": fields}
     raise InputError(f"{where} is of a kind that cannot be written, {type(value).__name__}")
+
+
+def _contents(kind: Any) -> list[str]:
+    return [*(f.name for f in dataclasses.fields(kind)), *getattr(kind, "archived", ())]
 
 
 def _array(value: jax.Array | np.ndarray | np.generic, where: str) -> dict[str, Any]:
@@ -149,28 +139,13 @@ def _built(value: Any) -> Any:
 
 
 def _object(kind: type, contents: Mapping[str, Any]) -> Any:
-    """An object with these fields, and with their defaults those that were not written; none of its code runs."""
+    """An object with these fields; none of its code runs."""
     if not dataclasses.is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is no dataclass")
-    known = {f.name: f for f in dataclasses.fields(kind)}
-    cached = getattr(kind, "archived", ())  # worked out once, by a cached property
+    if wrong := set(contents).symmetric_difference(_contents(kind)):
+        raise TypeError(f"fields of {kind.__name__} differ: {', '.join(sorted(wrong))}")
     made = object.__new__(kind)
-    for name, content in contents.items():
-        if name in cached:
-            made.__dict__[name] = _built(content)
-        elif name in known:
-            object.__setattr__(made, name, _built(content))
-        else:
-            raise TypeError(f"{kind.__name__} has no field {name!r}")
-    for name, f in known.items():
-        if name in contents:
-            continue
-        if not f.metadata.get("archived", True):
-            object.__setattr__(made, name, None)
-        elif f.default is not dataclasses.MISSING:
-            object.__setattr__(made, name, f.default)
-        elif f.default_factory is not dataclasses.MISSING:
-            object.__setattr__(made, name, f.default_factory())
+    made.__dict__.update({name: _built(content) for name, content in contents.items()})
     return made
 
 

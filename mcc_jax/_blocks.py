@@ -21,17 +21,13 @@ NUMBERS = 4096  # of one array in a block of paths: with the dozen arrays betwee
 def in_blocks[**P, R](
     function: Callable[P, R], *, block: int | None = None, devices: tuple[Any, ...] | None = None
 ) -> Callable[P, R]:
-    r"""Map a function of one contact over many contacts, in blocks.
+    """Map a function of one contact over many contacts, in blocks: the values of `jax.vmap(function)`.
 
-    The same values as `jax.vmap(function)`, for contacts that do not depend on each other. What a block needs in
-    between stays in a core's cache, so that memory holds the arguments and the results and nothing else; on a CPU
-    gradients are several times faster for it. A CPU works on one block at a time for each device it shows: set
-    ``jax.config.update("jax_num_cpu_devices", cores)`` before the first computation and pass
-    ``devices=tuple(jax.devices())``. On a GPU, `jax.vmap` alone is faster unless memory is short.
-
-    Differentiate inside, ``in_blocks(jax.grad(energy))``, where each contact has its own parameters: outside it works
-    as well, in both modes, and computes each block twice in reverse mode. Raises `InputError` if the arrays differ in
-    length, have no axis to divide, or cannot be shared out equally.
+    What a block needs in between stays in a core's cache, so that gradients are several times faster on a CPU, which
+    works on one block at a time for each device it shows: set ``jax.config.update("jax_num_cpu_devices", cores)``
+    before the first computation and pass ``devices=tuple(jax.devices())``. On a GPU, `jax.vmap` alone is faster unless
+    memory is short. Differentiate inside, ``in_blocks(jax.grad(energy))``, where each contact has its own parameters:
+    outside it works as well, and computes each block twice in reverse mode.
 
     Args:
         function: of one contact; its positional arguments are trees of arrays without a batch axis.
@@ -40,10 +36,9 @@ def in_blocks[**P, R](
         devices: JAX devices over which the contacts are divided, in equal shares; the default device if None.
 
     Returns:
-        A function of the same arguments with one more axis in front, of the same length in every array.
+        A function of the same arguments with one more axis in front, of one length in every array. It raises
+        `InputError` if lengths differ, or cannot be divided by the devices.
     """
-    if not callable(function):
-        raise InputError(f"function must be a function, got {arguments.kind_of(function)}")
     if block is not None:
         block = arguments.whole(block, "block, a number of contacts,", least=1)
     one = jax.checkpoint(jax.vmap(function))
@@ -67,8 +62,7 @@ def in_blocks[**P, R](
         _check(arguments, len(devices or ()) or 1)
         if devices is None or len(devices) == 1:
             return share(*arguments)
-        axis = PartitionSpec("contacts")
-        mesh = Mesh(np.array(devices), ("contacts",))
+        axis, mesh = PartitionSpec("contacts"), Mesh(np.array(devices), ("contacts",))
         return jax.shard_map(share, mesh=mesh, in_specs=axis, out_specs=axis)(*arguments)
 
     return call  # pyright: ignore[reportReturnType]
@@ -81,8 +75,7 @@ def _suitable(arguments: Any) -> int:
 
 
 def even_size(count: int, block: int) -> int:
-    """The largest size of a block that leaves no remainder, which would be compiled again, if it is at least half of
-    what was asked for."""
+    """The largest block, from `block` down to half of it, that leaves no remainder, which would be compiled again."""
     block = max(1, min(count, block))
     return next((size for size in range(block, (block - 1) // 2, -1) if count % size == 0), block)
 

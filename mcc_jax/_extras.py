@@ -1,4 +1,4 @@
-"""What is installed: this package's version, and packages that only some parts need, by the extra that brings them."""
+"""Packages that only some parts need, by the extra that brings them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ._errors import InputError
-
-
-def own_version() -> str:
-    """The version of this package, or "(not installed)" where it runs from a folder only."""
-    from importlib.metadata import PackageNotFoundError, version  # slow, and few ask
-
-    try:
-        return version("mcc-jax")
-    except PackageNotFoundError:
-        return "(not installed)"
-
 
 EXTRAS = {
     "command": ("the command mcc-jax needs", ("click", "rich", "platformdirs")),

@@ -82,9 +82,7 @@ def interval(estimate: Mapping[str, Any], factor: float = 1.0) -> str | None:
     if ends is None:
         return None
     low, high = (end * factor for end in ends)
-    if not high > low:
-        return f"{number(low)} to {number(high)}"
-    places = decimals(max(abs(low), abs(high)), (high - low) / 2)
+    places = decimals(max(abs(low), abs(high)), (high - low) / 2) if high > low else None
     if places is None:
         return f"{number(low)} to {number(high)}"
     return f"{low:.{places}f} to {high:.{places}f}".replace("-", "−")
@@ -107,18 +105,7 @@ def probability(value: float | int | None) -> str:
 def span(values: Any, unit: str, digits: int = 4) -> str:
     """Smallest and largest, or the one value."""
     low, high = number(float(np.min(values)), digits), number(float(np.max(values)), digits)
-    return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
-
-
-def value_of(value: Any, unit: str = "") -> str:
-    """A parameter of a module in words: its value, the range of a batch, or its placeholder while JAX traces."""
-    mark = f" {unit}" if unit else ""
-    if is_traced(value) or not hasattr(value, "shape"):
-        return f"{value}{mark}"
-    array = np.asarray(value, float)
-    if array.size <= 1:
-        return f"{number(float(array.ravel()[0]))}{mark}" if array.size else "none"
-    return f"{number(float(array.min()))} to {number(float(array.max()))}{mark} ({array.shape[0]} of them)"
+    return (low if low == high else f"{low} to {high}") + f" {unit}".rstrip()
 
 
 def table(title: str, rows: list[tuple[str, str]], most: int = 20) -> str:
@@ -128,8 +115,7 @@ def table(title: str, rows: list[tuple[str, str]], most: int = 20) -> str:
     return "\n".join(lines if len(lines) <= most else [*lines[: most - 1], f"  ... and {len(lines) - most + 1} more"])
 
 
-WIDE, LONG = 100, 70
-"""Characters of an object in one line, and of one value in a table."""
+WIDE, LONG = 100, 70  # characters of an object in one line, and of one value in a table
 
 
 def described(**units: str) -> Any:
@@ -184,8 +170,7 @@ def _cut(text: str) -> str:
 
 
 def _array_in_words(value: Any, unit: str) -> str:
-    size = " × ".join(map(str, value.shape))
-    dtype, mark = str(value.dtype), f" {unit}" if unit else ""
+    size, dtype = " × ".join(map(str, value.shape)), str(value.dtype)
     numeric = dtype.startswith(("float", "int", "uint", "bool", "bfloat"))
     if not numeric or not getattr(value, "is_fully_addressable", True) or not hasattr(value, "__array__"):
         return f"{size} of {dtype}".strip()
@@ -198,6 +183,6 @@ def _array_in_words(value: Any, unit: str) -> str:
     if not known.size:
         return f"{size} values, none finite" if array.size else "no values"
     if array.size <= 4:
-        return f"[{', '.join(number(float(x)) if math.isfinite(x) else str(x) for x in array.ravel())}]{mark}"
-    low, high = number(float(known.min())), number(float(known.max()))
-    return f"{size} values, {low} to {high}{mark}" if low != high else f"{size} values, all {low}{mark}"
+        each = [number(float(x)) if math.isfinite(x) else str(x) for x in array.ravel()]
+        return f"[{', '.join(each)}] {unit}".rstrip()
+    return f"{size} values, {span(known, unit)}"

@@ -73,7 +73,7 @@ def _running_max(path: Shaped[Array, " steps"], width: int = 8) -> Shaped[Array,
 def _largest_of_each(blocks: Shaped[Array, "blocks width"]) -> Shaped[Array, " blocks"]:
     """Largest value of each row; NaN if there is one.
 
-    A plain maximum XLA hands to a library whose calls cost more than the work, here half of a law's time on a path.
+    XLA hands a plain maximum to a library whose calls take half of a law's time on a path.
     """
 
     def larger(a, b):
@@ -94,18 +94,13 @@ def horner(coefficients: tuple[float, ...], x: Float[Array, ...]) -> Float[Array
 def compiled_whole[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function as a whole where it is called from plain Python; within other compiled code it dissolves.
 
-    Called step by step, a law is fifty small operations that JAX compiles one at a time, seconds in all; this takes a
-    tenth of a second, and as little again for other numbers.
+    Otherwise JAX compiles the fifty small operations of a law one at a time, which takes seconds.
     """
     return cast(Any, jax.jit)(function, inline=True)
 
 
 def compiled[**P, R](function: Callable[P, R], level: int = 1) -> Callable[P, R]:
-    """`equinox.filter_jit` with less optimisation: a fifth less time to compile, the same speed.
-
-    A new campaign in a new process waits for compilation longer than for anything else. Within other compiled code it
-    dissolves.
-    """
+    """`equinox.filter_jit` with less optimisation: a fifth less time to compile, the same speed; dissolves likewise."""
     whole = cast(Any, eqx.filter_jit)(function, compiler_options={"xla_backend_optimization_level": level})
 
     @functools.wraps(function)

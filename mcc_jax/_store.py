@@ -9,10 +9,10 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from ._errors import InputError
 
@@ -42,9 +42,7 @@ def results(directory: Path) -> Iterator[Stage]:
 
     The folder, made with its parents if need be, is locked meanwhile. The stage is renamed when it is complete: a
     process killed before leaves the old results, and after one that is killed later the next run in this folder moves
-    what is left of the new ones. Only files that the run wrote, or named as stale, are touched.
-
-    Raises `InputError` if the folder cannot be written, or another run is writing there.
+    what is left of the new ones. Raises `InputError` if the folder cannot be written, or another run is writing there.
     """
     made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     try:
@@ -127,7 +125,7 @@ def _locked(directory: Path) -> Iterator[None]:
 
 
 def _as_input_error(directory: Path, error: BaseException) -> BaseException:
-    """The error for the user, who knows the folder but not the stage."""
+    """The error in terms of the folder that the user gave."""
     if isinstance(error, InputError):
         return error.changed(file=directory) if WORK in str(error.file) else error
     if not isinstance(error, OSError):
@@ -141,12 +139,12 @@ def _as_input_error(directory: Path, error: BaseException) -> BaseException:
     return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
 
 
-def write_file(file: Path, write: Callable[[BinaryIO], object]) -> None:
+def write_file(file: Path, content: bytes) -> None:
     """Write one file, in a folder that exists; it replaces an older one when it is complete and on the disk."""
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as stream:
-            write(stream)
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         Path(name).replace(file)

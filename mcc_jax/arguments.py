@@ -21,8 +21,6 @@ from jax.core import Tracer
 
 from ._errors import InputError
 
-A_PATH = "a path is a 1-D array of at least one point"
-
 
 def is_traced(value: Any) -> bool:
     """Whether a value, or one of a list of values, is known only when compiled code runs."""
@@ -75,22 +73,18 @@ def number(
     above: float | int = -math.inf,
     most: float | int = math.inf,
     below: float | int = math.inf,
-    infinite: bool = False,
 ) -> float:
-    """A number, finite and within bounds, as a Python float: `least` and `most` are allowed, `above` and `below` not.
+    """A finite number as a Python float: `least` and `most` are allowed, `above` and `below` are not.
 
-    It may be of NumPy, JAX or pandas, and infinite if that is allowed. The name is for messages, with its unit.
+    It may be of NumPy, JAX or pandas. The name is for messages, with its unit.
     """
+    found = float(value) if is_number(value) else math.nan
+    if math.isfinite(found) and least <= found <= most and above < found < below:
+        return found
     bounds = {">=": least, ">": above, "<=": most, "<": below}
-    limits = " and ".join(f"{sign} {bound:g}" for sign, bound in bounds.items() if math.isfinite(bound))
-    must = f"{name} must be a {'' if infinite else 'finite '}number {limits}".rstrip()
-    if not is_number(value):
-        raise InputError(f"{must}, got {shown(value)}")
-    found = float(value)
-    inside = least <= found <= most and (found > above or above == -math.inf) and (found < below or below == math.inf)
-    if not inside or (math.isinf(found) and not infinite):
-        raise InputError(f"{must}, got {found:g}")
-    return found
+    limits = "".join(f" and {sign} {bound:g}" for sign, bound in bounds.items() if math.isfinite(bound))
+    must = f"{name} must be a finite number{limits.removeprefix(' and')}"
+    raise InputError(f"{must}, got {f'{found:g}' if is_number(value) else shown(value)}")
 
 
 def whole(value: Any, name: str, *, least: int = 0, most: int | None = None) -> int:
@@ -123,10 +117,7 @@ def _array_of(value: Any) -> np.ndarray | None:
 
 
 def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.ndarray:
-    """Numbers as a NumPy array of floating-point numbers: from a list, a Series, an array of any kind.
-
-    An array that is one already is handed back itself; tracers are not for this function.
-    """
+    """Numbers as a NumPy array of floats: from a list, a Series, an array of any kind; no tracers."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes) and not hasattr(value, "__array__"):
         value = list(value)
     array = None if isinstance(value, str | bytes) else _array_of(value)
@@ -155,16 +146,16 @@ def values(value: Any, name: str, *, shape: str = "a number or an array of numbe
 
 
 def path(value: Any, name: str, *, many: str = "") -> jax.Array:
-    """A path: a 1-D array of at least one point, from a list, a Series, an array of any kind; tracers pass.
-
-    `many` says in words what to do with several paths at once.
-    """
+    """A 1-D array of at least one point, from anything that `values` takes; `many` is the remedy for several paths."""
     array = values(value, name, shape="a 1-D array of at least one point")
-    if array.ndim == 1 and array.shape[0] > 0:
+    if array.ndim == 1 and array.size > 0:
         return array
-    problem = "an empty one" if array.size == 0 else "one number" if array.ndim == 0 else f"the shape {array.shape}"
-    remedy = many if array.ndim > 1 and many else f"For one point write [{shown(value)}]." if array.ndim == 0 else None
-    raise InputError(f"{name}: {A_PATH}, got {problem}", remedy=remedy)
+    problem, remedy = f"the shape {array.shape}", many or None
+    if array.size == 0:
+        problem, remedy = "an empty one", None
+    elif array.ndim == 0:
+        problem, remedy = "one number", f"For one point write [{shown(value)}]."
+    raise InputError(f"{name}: a path is a 1-D array of at least one point, got {problem}", remedy=remedy)
 
 
 def same_length(**arrays: Any) -> int:
@@ -180,36 +171,33 @@ def same_length(**arrays: Any) -> int:
     return len(one)
 
 
-def diameters(value: Any, name: str = "diameters_um") -> np.ndarray:
+def diameters(value: Any) -> np.ndarray:
     """D1, D2, D3 [um] of N particles as an array of shape (N, 3), all positive and finite."""
-    array = floats(value, name, shape="D1, D2, D3 [um] of every particle, shape (N, 3)")
+    array = floats(value, "diameters_um", shape="D1, D2, D3 [um] of every particle, shape (N, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
+        problem = f"diameters_um has the shape {array.shape} where (N, 3) is expected: D1, D2, D3 [um]"
         remedy = "For one particle write [[D1, D2, D3]]." if array.shape == (3,) else None
-        raise InputError(f"{name} has the shape {array.shape} where (N, 3) is expected: D1, D2, D3 [um]", remedy=remedy)
-    wrong = np.flatnonzero(~(np.isfinite(array) & (array > 0)).all(axis=1))
-    if wrong.size:
-        i = int(wrong[0])
-        raise InputError(f"{name}: the diameters {array[i].tolist()} um of particle {i + 1} are not positive numbers")
+        raise InputError(problem, remedy=remedy)
+    for i in np.flatnonzero(~(np.isfinite(array) & (array > 0)).all(axis=1)):
+        sizes = f"the diameters {array[i].tolist()} um of particle {i + 1}"
+        raise InputError(f"diameters_um: {sizes} are not positive numbers")
     return array
 
 
-def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
+def one_particle(value: Any) -> np.ndarray:
     """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite."""
-    array = floats(value, name, shape="D1, D2, D3 [um] of one particle")
-    if array.shape == (3,) and (np.isfinite(array) & (array > 0)).all():
-        return array
-    got = shown(array.tolist())
-    raise InputError(f"{name}: a particle has three positive diameters D1, D2, D3 [um], got {got}")
+    array = floats(value, "diameters_um", shape="D1, D2, D3 [um] of one particle")
+    if array.shape != (3,):
+        raise InputError(f"diameters_um must be D1, D2, D3 [um] of one particle, got {shown(array.tolist())}")
+    return diameters(array[None])[0]
 
 
 def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) -> None:
-    """Refuse a size that is not positive (or `zero`) and finite, where it can be looked at.
-
-    With `plain` only numbers of Python and numpy are, not results of a computation.
-    """
-    checked = not is_traced(value) and not (plain and isinstance(value, jax.Array))
-    array = np.asarray(value) if checked else None
-    if array is None or array.dtype.kind not in "iuf":
+    """Refuse a size that is not positive (or `zero`) and finite; tracers pass, with `plain` all that JAX computed."""
+    if is_traced(value) or (plain and isinstance(value, jax.Array)):
+        return
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf":
         return  # what is no number at all is refused where it is converted
     if not (np.isfinite(array) & (array >= 0 if zero else array > 0)).all():
         must = "zero or positive" if zero else "positive"

@@ -22,8 +22,7 @@ UNPACKED_BYTES = 512 * 2**20  # what a zip archive of tests or a workbook unpack
 def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> bytes:
     """The bytes of a regular file, to which links may lead.
 
-    Raises `InputError` if there is none, it is no regular file, it cannot be read, or it is larger than `most_bytes`;
-    `remedy` is what to do then.
+    Raises `InputError` if there is none, it is no regular file, it cannot be read, or, with `remedy`, it is too large.
     """
     file = Path(path)
     try:
@@ -38,15 +37,8 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
     if stat.S_ISDIR(found.st_mode):
         problem, remedy = "this is a folder where a file is expected", "Give a file"
     elif stat.S_ISREG(found.st_mode):
-        sizes = f"{_in_words(found.st_size)}, where at most {_in_words(most_bytes)} are read"
-        problem = f"the file is too large: {sizes}"
+        size, most = found.st_size / 2**20, most_bytes / 2**20
+        problem = f"the file is too large: {size:.4g} MiB, where at most {most:.4g} MiB are read"
     else:  # a pipe may never answer, a device never end
         problem, remedy = "this is no regular file", "Save what it delivers in a file and give that"
     raise InputError(problem, file=file, remedy=remedy)
-
-
-def _in_words(size: int) -> str:
-    for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
-        if size >= unit:
-            return f"{size / unit:.4g} {name}"
-    return f"{size} bytes"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._format import value_of
+from ._format import described
 from ._numerics import compiled_whole, positive_pow, recompute
 from ._types import Scalar, ScalarLike, Values, scalar
 from .arguments import diameters, finite, is_traced, positive
@@ -33,9 +33,6 @@ class Particle(eqx.Module):
         D1, D2: diameters in the plane of the platens [um], > 0.
         D3: diameter along the direction of compression [um], > 0.
 
-    Raises:
-        InputError: for a diameter that is not positive and finite, where it has a value: not inside `jax.jit`.
-
     References:
         Bommireddy et al. (2018), text below eq. 1 (in its Table 1 the major diameter is D1 or D2).
     """
@@ -44,8 +41,7 @@ class Particle(eqx.Module):
     D2: Scalar = eqx.field(converter=_diameter)
     D3: Scalar = eqx.field(converter=_diameter)
 
-    def __repr__(self) -> str:
-        return f"Particle(D1={value_of(self.D1)}, D2={value_of(self.D2)}, D3={value_of(self.D3)} um)"
+    __repr__ = described(D1="um", D2="um", D3="um")
 
     @property
     def effective_diameter(self) -> Scalar:
@@ -135,11 +131,7 @@ def elastic_shape_factor(particle: Particle) -> Scalar:
 
 
 def particle_batch(diameters_um: Any) -> Particle:
-    """One `Particle` whose fields have a leading axis N, from diameters [um] of shape (N, 3).
-
-    Raises:
-        InputError: for another shape, or a diameter that is not positive and finite; traced ones pass.
-    """
+    """One `Particle` whose fields have a leading axis N, from diameters [um] of shape (N, 3)."""
     sizes = diameters_um if is_traced(diameters_um) else diameters(diameters_um)
     # Not cut by JAX unless it must: every operation on another number of particles would be compiled.
     D1, D2, D3 = jnp.asarray(sizes, dtype=float).T if is_traced(sizes) else (jnp.asarray(x, float) for x in sizes.T)

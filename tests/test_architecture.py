@@ -13,7 +13,7 @@ import mcc_jax
 PACKAGE = Path(mcc_jax.__file__).parent
 # Every top-level module by layer; one not listed fails the test. Those of the first layer may import each other.
 ORDER = (
-    ("_errors", "_extras", "_types", "_numerics", "_results", "arguments"),
+    ("_version", "_errors", "_extras", "_types", "_numerics", "_results", "arguments"),
     ("_format", "_blocks", "files"),
     ("_archive", "_store", "geometry"),
     *((name,) for name in ("formulas", "effects", "law", "campaign", "simulate", "calibrate", "dem", "discovery")),

@@ -123,7 +123,6 @@ def examples(folder: Path) -> dict[str, Example]:
         "Solver": Example(dem.Solver, rtol=1e-10, max_steps=150, halvings=4, skin=0.5),
         "fit_compaction": Example(dem.fit_compaction, packing_of=lambda _: packing, start=np.ones(2), state=None,
             heights=heights, force=heights, run=False),
-        "curve_tables": Example(export.curve_tables, law=the_law, strain_max=0.67, tolerance=1e-5, run=False),
         "golden_table": Example(export.golden_table, law=the_law, particle=particle, seed=0, units="SI", run=False),
         "jax_artefact": Example(export.jax_artefact, law=the_law, particle=particle, which="step", dtype="float64",
             run=False),

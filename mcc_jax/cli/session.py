@@ -202,14 +202,14 @@ def provenance(
     import platform
     from importlib.metadata import version
 
-    from .._extras import own_version
+    from .._version import __version__
     from ..campaign import file_checksums
 
     settings = {
         name: value.name if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
         for name, value in settings.items()
     }
-    versions = {"mcc_jax": own_version(), "python": platform.python_version(), **{n: version(n) for n in PACKAGES}}
+    versions = {"mcc_jax": __version__, "python": platform.python_version(), **{n: version(n) for n in PACKAGES}}
     return {
         "campaign": {"folder": folder or str(campaign.resolve()), "sha256": file_checksums(campaign)},
         "settings": {"command": command, **settings},

@@ -254,8 +254,7 @@ def save_state(path: str | Path, packing: Packing, state: State) -> None:
     path = arguments.file_path(path, "path")
     if not path.parent.is_dir():
         raise InputError("no such folder", file=path.parent, remedy="Make it first.")
-    content = encode((packing, state))
-    write_file(path, lambda stream: stream.write(content))
+    write_file(path, encode((packing, state)))
 
 
 def load_state(path: str | Path) -> tuple[Packing, State]:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._format import value_of
+from .._format import in_words
 from .._types import Scalar, Values, scalar
 from ..formulas import Formulas
 from ..geometry import Particle
@@ -52,8 +52,8 @@ class AbstractEffect(eqx.Module):
 
     def __repr__(self) -> str:
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "amplitude"}
-        further = [f"{name} {value_of(value)}" for name, value in values.items() if hasattr(value, "shape")]
-        return ", ".join([f"{self.name} of amplitude {value_of(self.amplitude)}", *further])
+        further = [f"{name} {in_words(value)}" for name, value in values.items() if hasattr(value, "shape")]
+        return ", ".join([f"{self.name} of amplitude {in_words(self.amplitude)}", *further])
 
     @property
     def name(self) -> str:

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from .._extras import extra, own_version
+from .._extras import extra
 from .._types import Scalar
+from .._version import __version__
 from ..dem import half_contact
 from ..formulas import Formulas, Plastic
 from ..geometry import Particle
@@ -28,12 +29,11 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin = 
     It holds force, tangent and history of one particle between platens, and of a pair of half contacts, for all forms
     of unloading and strain scaling. Coefficients are passed as a struct, so that every particle can have its own.
     Effects that are closed formulas are part of it (`AbstractEffect.closed`), with their numbers as constants. The
-    comment on top says where the law comes from (`origin`) and, of a `particle` that the law must carry, its size.
+    comment on top states the `origin` of the law and the size of a `particle`. A law that is not monotone is accepted.
 
     Raises:
         InputError: if a parameter is out of its range, the particle carries no stress, or an effect is no closed
-            formula or makes a contact gain energy. A law that is not monotone is passed on, unlike by
-            `read_calibration`: a pair of such contacts has several solutions.
+            formula or makes a contact gain energy.
     """
     return _rendered("mcc_law.h.j2", law, particle, origin)
 
@@ -65,7 +65,7 @@ def _rendered(template: str, law: MccLaw, particle: Particle | None, origin: Ori
         parameters=parameters_in_c(law),
         factor=factor_in_c(law, particle),
         effects=_quoted(", ".join(effect.name for effect in law.effects))[1:-1],
-        version=own_version(),
+        version=__version__,
         origin=_origin_lines(law, particle, origin),
         strain_max=TESTED_STRAIN,
         forms=Unloading,
@@ -76,15 +76,12 @@ def _rendered(template: str, law: MccLaw, particle: Particle | None, origin: Ori
 
 
 def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
-    """Where the values come from, a fact a line."""
     lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
     for one in effects_of(law):
         values = ", ".join(f"{name} = {value:.6g}" for name, value in one["numbers"].items())
         lines.append(_quoted(f"Effect {one['name']}: {one['equation']}; {values}.")[1:-1])
-    if origin.calibration is not None:
-        c = origin.calibration
-        file, method = _quoted(str(c["file"])), _quoted(str(c["method"]))
-        lines.append(f"From {file}, method {method}, sha256 {str(c['sha256'])[:16]}...")
+    if c := origin.calibration:
+        lines.append(f"From {_quoted(c['file'])}, method {_quoted(c['method'])}, sha256 {str(c['sha256'])[:16]}...")
         if not c["converged"]:
             lines.append("WARNING: that calibration did not converge.")
     whose = "the population (medians)" if origin.particle is None else f"particle {_quoted(origin.particle)}"
@@ -140,10 +137,9 @@ _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 
 
 def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A function of as many scalars as names as C: the statements, and what to write for each result.
+    """A function of as many scalars as names, traced by JAX, as C: the statements, and what to write for each result.
 
-    JAX traces it; so C computes what the library computes, of an effect of the user's own, too. An operation that has
-    no counterpart in C raises `InputError`.
+    Raises `InputError` for an operation that has no counterpart in C.
     """
     traced = jax.make_jaxpr(function)(*(jnp.ones(()) for _ in names))
     statements: list[tuple[str, str, str]] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -27,21 +27,17 @@ _ALL = "particles of any size, each with coefficients of its own; a and the modu
 def signatures(law: MccLaw) -> dict[Which, dict[str, Any]]:
     """The functions there are of a law, with arguments and results; effects need time and a memory."""
     x, past, F = "displacement_um (b,)", "displacement_max_um (b,)", "force_mN (b,)"
+    second = "time_s (b,)" if law.effects else past
     each = ["diameters_um D1, D2, D3 (b, 3)", "coefficients C1, C3, C5 (b, 3)"]
-    if law.effects:
-        second, memory = "time_s (b,)", ["what `memory` lists, one by one"]
-        other: Which = "step_load"
-        first = {"arguments": [F, second, *memory], "results": [x, *memory], "of": _OWN}
-    else:
-        second, memory = past, []
-        other = "force"
-        first = {"arguments": [x, past], "results": [F], "of": _OWN}
+    memory = ["what `memory` lists, one by one"] if law.effects else []
     results = [F, "tangent_mN_per_um (b,)", *(memory or [f"{past} after the step"])]
-    return {
-        other: first,
-        "step": {"arguments": [x, second, *memory], "results": results, "of": _OWN},
-        "step_each": {"arguments": [x, second, *each, *memory], "results": results, "of": _ALL},
-    }
+    step = {"arguments": [x, second, *memory], "results": results, "of": _OWN}
+    step_each = {"arguments": [x, second, *each, *memory], "results": results, "of": _ALL}
+    if law.effects:
+        step_load = {"arguments": [F, second, *memory], "results": [x, *memory], "of": _OWN}
+        return {"step_load": step_load, "step": step, "step_each": step_each}
+    force = {"arguments": [x, past], "results": [F], "of": _OWN}
+    return {"force": force, "step": step, "step_each": step_each}
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,6 @@ def jax_artefact(
     which: Which = "step",
     *,
     dtype: Literal["float64", "float32"] = "float64",
-    platforms: Sequence[str] = PLATFORMS,
 ) -> Artefact:
     """A function of many contacts at once, serialised by `jax.export` with its reverse-mode derivative.
 
@@ -77,12 +72,10 @@ def jax_artefact(
         force, tangent, *memory = step(displacement, time, *memory)
 
     Args:
-        law: its numbers become constants.
-        particle: its numbers become constants, but for `step_each`.
+        law, particle: their numbers become constants, those of the particle not in `step_each`.
         which: `force`, `step` (force, tangent, history) or `step_each` (the same, sizes and C1, C3, C5 as arguments);
             of a law with effects `step`, `step_each` or `step_load` (displacement under a force).
         dtype: precision of arguments, results and constants; float64 needs `jax_enable_x64` here and where it runs.
-        platforms: for which JAX lowers it.
 
     Raises:
         InputError: if float64 is wanted and JAX is in single precision.
@@ -93,28 +86,25 @@ def jax_artefact(
     functions = signatures(law)
     arguments.choice(which, functions, "which")
     arguments.choice(dtype, ("float64", "float32"), "dtype")
-    for name in platforms:
-        arguments.choice(name, PLATFORMS, "platform")
     if dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         remedy = 'Call jax.config.update("jax_enable_x64", True) or take float32'
         raise InputError("JAX is in single precision", remedy=remedy)
-    law, particle = (
-        jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree) for tree in (law, particle)
-    )
+    law, particle = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (law, particle))
     start, structure = jax.tree_util.tree_flatten_with_path(law.init(particle))
     (batch,) = jax.export.symbolic_shape("b")
     one, triple = (jax.ShapeDtypeStruct((batch, *shape), jnp.dtype(dtype)) for shape in ((), (3,)))
     inputs = [one, one, triple, triple] if which == "step_each" else [one, one]
-    memory = []
+    memory = {}
     if law.effects:
         inputs += [jax.ShapeDtypeStruct((batch, *leaf.shape), leaf.dtype) for _, leaf in start]
         named = [(jax.tree_util.keystr(path).removeprefix("."), leaf) for path, leaf in start]
-        memory = [{"name": n, "shape": [*x.shape], "dtype": str(x.dtype), "start": x.tolist()} for n, x in named]
+        rows = [{"name": n, "shape": [*x.shape], "dtype": str(x.dtype), "start": x.tolist()} for n, x in named]
+        memory = {"memory": rows}
     function = jax.jit(jax.vmap(_function(law, particle, which, structure)))
-    exported = jax.export.export(function, platforms=tuple(platforms))(*inputs)
+    exported = jax.export.export(function, platforms=PLATFORMS)(*inputs)
     signature = {
         **functions[which],
-        **({"memory": memory} if law.effects else {}),
+        **memory,
         "dtype": dtype,
         "batch_size": "symbolic",
         "reverse_mode": "one order",

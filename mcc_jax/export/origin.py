@@ -101,15 +101,15 @@ def check(law: MccLaw, particle: Particle | None, *, monotone: bool = False) -> 
 def read_calibration(
     folder: str | Path, *, particle: str | None = None, diameters: str | None = None, allow_not_monotone: bool = False
 ) -> tuple[MccLaw, Particle, Origin]:
-    """The law that a calibration or a discovery found, for the population or one particle, and a particle for it.
+    """The law that a calibration or a discovery found, and a particle for it.
 
     The population's law has the medians of its coefficients, exp(mean of log C). A discovery's has the effects that
     were added, except those of the instrument.
 
     Args:
         folder: what `mcc_jax.load` reads.
-        particle: take this particle's coefficients.
-        diameters: `D1,D2,D3` [um], or a table of particles; if None, those of the calibrated campaign. Of several, that
+        particle: the one whose coefficients are taken; those of the population if None.
+        diameters: `D1,D2,D3` [um], or a table of particles; those of the calibrated campaign if None. Of several, that
             particle's own, or the mean.
         allow_not_monotone: warn of a loading curve that falls, instead of refusing it.
 
@@ -127,9 +127,7 @@ def read_calibration(
         shown, geometry = _sizes(found, particle, diameters)
         check(law, shown, monotone=not allow_not_monotone)
     except InputError as error:
-        if error.file is not None:
-            raise
-        raise InputError(error.problem, file=file, remedy=error.remedy) from error
+        raise error.changed(file=error.file or file) from error
     content = found.to_json()
     converged = content.get("converged", True)
     values = content.get("parameters_after") or content.get("parameters_before") or content  # of a discovery
@@ -148,9 +146,7 @@ def read_calibration(
     if particle is None and content.get("modulus_scatter") is not None:
         warnings.append("moduli scatter between particles in this calibration; this is the population's")
     if not bool(law.is_monotone):
-        warnings.append(
-            f"{_FALLING}; under load control it snaps through, and a pair of such contacts has several solutions"
-        )
+        warnings.append(f"{_FALLING}; load control snaps through, and a pair of such contacts has several solutions")
     if observed := [effect.name for effect in whole.effects if effect.of_instrument]:
         warnings.append(f"{', '.join(observed)} belong to the instrument, not to the particle, and are left out")
     calibration = {

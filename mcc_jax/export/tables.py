@@ -33,6 +33,7 @@ else:
     Table = object
 
 Columns = dict[str, np.ndarray]
+TOLERANCE = 1e-5  # largest error of linear interpolation, as a share of each column's largest value
 MIN_ROWS, MAX_ROWS = 64, 65536
 BETWEEN = 8  # points at which an interval is checked
 CORNERS = 4096  # intervals in which a corner is looked for
@@ -54,9 +55,8 @@ class CurveTables:
     Attributes:
         loading: `scaled_strain` (eta_p eps), `stress_MPa`, `tangent_MPa` (d stress / d scaled strain),
             `recovered_strain_at_eta_1`, the strain that a particle of shape factor 1 recovers from there, and
-            `recovered_strain_formula_at_eta_1`, the same without its limit. Of another shape factor a particle recovers
-            the latter times eta_p^((1 - p)/2), and at most the smaller of `scaled_strain` and (3 pi/8) `stress_MPa` /
-            `tangent_MPa` (where that is positive), over eta_p: so no unloading gains energy (`recoverable_strain`).
+            `recovered_strain_formula_at_eta_1`, the same without its limit. `master_curve.json` of `write_export` has
+            the rule for other shape factors.
         unloading: `recovered_share` s and `stress_share` g(s) of the peak stress.
         error: largest error of linear interpolation, as a share of each column's largest value.
     """
@@ -68,16 +68,11 @@ class CurveTables:
     __repr__ = described()
 
 
-def curve_tables(
-    law: MccLaw, particle: Particle | None = None, *, strain_max: float = TESTED_STRAIN, tolerance: float = 1e-5
-) -> CurveTables:
-    """Tables of the master curves of a law; sizes and shapes come in through the scaled strain.
+def curve_tables(law: MccLaw, particle: Particle | None = None) -> CurveTables:
+    """Tables of the master curves of a law, right to 1e-5, up to the largest scaled strain of the paper's tests.
 
-    Args:
-        law: the law.
-        particle: the one that the tables hold for if the law has effects; without effects they hold for all.
-        strain_max: where the loading table ends [-].
-        tolerance: largest error of linear interpolation, as a share of each column's largest value.
+    Without effects they hold for all particles, whose size and shape come in through the scaled strain; with effects
+    for `particle` alone.
 
     Raises:
         InputError: if 65536 points do not suffice, or naming an effect that is no closed formula.
@@ -85,8 +80,6 @@ def curve_tables(
     import pandas as pd
 
     check(law, particle)
-    strain_max = arguments.number(strain_max, "strain_max", above=0)
-    tolerance = arguments.number(tolerance, "tolerance", above=0)
     formulas, side = law, None
     if law.effects:
         if particle is None:
@@ -96,47 +89,46 @@ def curve_tables(
     n, k = law.unloading.stress_power, law.unloading.constant
     plain = Contact(*formulas.plastic.polynomial, 1 / (k * formulas.effective_modulus**n), power=n)
 
-    def curves(t: np.ndarray) -> Columns:
-        x, contact = strain_max * t**3, plain
+    def curves(t: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Scaled strain, secant and tangent [MPa], recovered strain by the formula, and its limit."""
+        x, contact = TESTED_STRAIN * t**3, plain
         if side is not None:
             ratio = side.at_peak(jnp.asarray(side.tested / TESTED_STRAIN * x)).c / side.c
             contact = eqx.tree_at(lambda one: one.c, contact, contact.c * ratio)
-        values = map(np.asarray, _curves(contact, jnp.asarray(x)))
-        return {"x": x, **dict(zip(("secant", "tangent", "formula", "limit"), values, strict=True))}
+        return x, *map(np.asarray, _curves(contact, jnp.asarray(x)))
 
     def loading(t: np.ndarray) -> Columns:
-        at = curves(t)
+        x, secant, tangent, formula, limit = curves(t)
         return {
-            "scaled_strain": at["x"],
-            "stress_MPa": at["x"] * at["secant"],
-            "tangent_MPa": np.where(at["secant"] > 0, at["tangent"], 0.0),
-            "recovered_strain_at_eta_1": np.minimum(at["formula"], at["limit"]),
-            "recovered_strain_formula_at_eta_1": at["formula"],
+            "scaled_strain": x,
+            "stress_MPa": x * secant,
+            "tangent_MPa": np.where(secant > 0, tangent, 0.0),
+            "recovered_strain_at_eta_1": np.minimum(formula, limit),
+            "recovered_strain_formula_at_eta_1": formula,
         }
 
     def unloading(t: np.ndarray) -> Columns:
         s = 1 - (1 - t) ** 2
         return {"recovered_share": s, "stress_share": np.asarray(stress_ratio(jnp.asarray(s)))}
 
-    up, one = _refined(loading, tolerance, _corners(curves))
-    down, other = _refined(unloading, tolerance, [])
+    up, one = _refined(loading, _corners(curves))
+    down, other = _refined(unloading, [])
     return CurveTables(pd.DataFrame(up), pd.DataFrame(down), max(one, other))
 
 
 @compiled_whole
 def _curves(contact: Contact, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
     top, bottom, _ = contact.limit(x)
     return contact.secant(x), contact.tangent(x), jnp.sqrt(contact.formula_squared(x)), top / bottom
 
 
-def _corners(curves: Callable[[np.ndarray], Columns]) -> list[float]:
+def _corners(curves: Callable[[np.ndarray], tuple[np.ndarray, ...]]) -> list[float]:
     """Where the recovered strain bends sharply, as t: its limit begins to hold, or ends to."""
     from scipy.optimize import brentq
 
     def gaps(t: np.ndarray) -> np.ndarray:
-        at = curves(t)
-        return np.stack([at["formula"] - at["limit"], at["tangent"] - SHARE * at["secant"]])
+        _, secant, tangent, formula, limit = curves(t)
+        return np.stack([formula - limit, tangent - SHARE * secant])
 
     t, found = np.linspace(0.0, 1.0, CORNERS + 1), []
     for k, sign in enumerate(np.sign(gaps(t))):
@@ -145,7 +137,7 @@ def _corners(curves: Callable[[np.ndarray], Columns]) -> list[float]:
     return found
 
 
-def _refined(columns: Callable[[np.ndarray], Columns], tolerance: float, corners: list[float]) -> tuple[Columns, float]:
+def _refined(columns: Callable[[np.ndarray], Columns], corners: list[float]) -> tuple[Columns, float]:
     """Columns, the abscissa first, at as few even points and the corners as the tolerance allows; and their error."""
     count = MIN_ROWS
     while count <= MAX_ROWS:
@@ -156,10 +148,10 @@ def _refined(columns: Callable[[np.ndarray], Columns], tolerance: float, corners
             np.abs(np.interp(finer[x], table[x], table[name]) - finer[name]).max() / np.abs(finer[name]).max()
             for name in table
         )
-        if error <= tolerance:
+        if error <= TOLERANCE:
             return table, float(error)
         count *= 2
-    problem = f"{MAX_ROWS} points do not describe the curve to {tolerance:g}: it has a corner"
+    problem = f"{MAX_ROWS} points do not describe the curve to {TOLERANCE:g}: it has a corner"
     raise InputError(problem, remedy="Export this law in another format")
 
 
@@ -167,23 +159,22 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units
     """Paths of one particle between two platens with the law's force and tangent.
 
     The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
-    every place where branches meet; the last unloads from small peaks; the others are random, by the seed.
+    every place where branches meet; the last unloads from small peaks; the others are random, by the seed. Every path
+    starts from a virgin particle.
 
     Returns:
-        A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
-        tangent, the unit in the column's name. Every path starts from a virgin particle. Of a law with effects that are
-        no closed formula: path, time (a second from point to point), displacement and force.
+        A pandas table of path, displacement, largest displacement so far, force and tangent; of a law with effects that
+        are no closed formula path, time, displacement and force.
     """
     check(law, particle)
-    seed, units = arguments.seed(seed), arguments.choice(units, get_args(Units), "units")
+    seed = arguments.seed(seed)
     try:
         side = half_contact(law, particle)
     except InputError:  # no closed formula: point by point, as `mcc_jax.drive`
         return _in_units(_driven(law, particle, seed), units)
-    rows = _contact_rows(side, None, seed)
-    rows[["displacement", "displacement_max"]] *= 2  # half of it at each platen
-    rows["tangent"] *= 0.5
-    return _in_units(rows, units)
+    columns = _of_contact(side, None, seed)
+    half = {"displacement": 2.0, "displacement_max": 2.0, "force": 1.0, "tangent": 0.5}  # of it at each platen
+    return _in_units({name: half.get(name, 1) * values for name, values in columns.items()}, units)
 
 
 def golden_pair_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> Table:
@@ -192,38 +183,30 @@ def golden_pair_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: 
     Both sides carry one force; see `dem.pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
     `wall`. Where the law is not monotone a pair has several answers, and the table holds one of them.
     """
-    import pandas as pd
-
     check(law, particle)
-    seed, units = arguments.seed(seed), arguments.choice(units, get_args(Units), "units")
-    smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
+    seed = arguments.seed(seed)
     side = half_contact(law, particle)
-    partners = {"equal": side, "smaller": half_contact(law, smaller), "wall": None}
-    tables = [_contact_rows(side, other, seed).assign(partner=name) for name, other in partners.items()]
-    return _in_units(pd.concat(tables, ignore_index=True), units)
+    smaller = half_contact(law, jax.tree.map(lambda d: d * OTHER_SIZE, particle))
+    tables = []
+    for name, other in {"equal": side, "smaller": smaller, "wall": None}.items():
+        columns = _of_contact(side, other, seed)
+        tables.append({"partner": np.full(len(columns["path"]), name), **columns})
+    return _in_units({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}, units)
 
 
-def _contact_rows(side: HalfContact, other: HalfContact | None, seed: int) -> Table:
+def _of_contact(side: HalfContact, other: HalfContact | None, seed: int) -> Columns:
     """Paths of the overlap of a pair, or with a rigid wall [um, mN]."""
-    import pandas as pd
-
     scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
-
-    def recovered(peak: np.ndarray) -> np.ndarray:
-        return np.asarray(_recovered_overlap(side, other, jnp.atleast_1d(peak))).reshape(np.shape(peak))
-
-    paths = _paths(scale, recovered, seed)
+    paths = _paths(scale, lambda peak: np.asarray(_recovered_overlap(side, other, jnp.asarray(peak))), seed)
     number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
     x, past = np.concatenate(paths), np.concatenate([np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths])
     force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
     columns = {"path": number, "displacement": 1e6 * x, "displacement_max": 1e6 * past}
-    return pd.DataFrame(columns | {"force": 1e3 * force, "tangent": 1e-3 * tangent})
+    return columns | {"force": 1e3 * force, "tangent": 1e-3 * tangent}
 
 
-def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
+def _driven(law: MccLaw, particle: Particle, seed: int) -> Columns:
     """Paths of a law whose effects have a memory, a second from point to point."""
-    import pandas as pd
-
     scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
@@ -235,8 +218,7 @@ def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
     x = np.array([np.pad(path, (0, length.max() - len(path)), "edge") for path in paths])  # so it compiles once
     along = eqx.filter_vmap(lambda x, time: law.path(particle, law.init(particle), x, time)[1], in_axes=(0, None))
     force = np.asarray(eqx.filter_jit(along)(jnp.asarray(x), jnp.arange(float(length.max()))))
-    columns = {"path": number, "time_s": second, "displacement": x[number, second], "force": force[number, second]}
-    return pd.DataFrame(columns)
+    return {"path": number, "time_s": second, "displacement": x[number, second], "force": force[number, second]}
 
 
 @eqx.filter_jit
@@ -260,10 +242,9 @@ def _contact(side: HalfContact, other: HalfContact | None, peak: Scalar, overlap
 def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:
     """A path that meets every branch, some at random, one of small peaks; the largest displacement is `scale`."""
     loading = np.linspace(0.0, 0.6 * scale, 13)
-    peak = loading[-1]
-    down = peak - recovered(np.asarray(peak)) * SHARES
-    further = np.linspace(peak, scale, 9)
-    end = scale - recovered(np.asarray(scale)) * SHARES
+    peaks = np.array([loading[-1], scale])
+    down, end = peaks[:, None] - recovered(peaks)[:, None] * SHARES
+    further = np.linspace(peaks[0], scale, 9)
     first = np.concatenate([[-0.01 * scale], loading, down, [-0.01 * scale], down[::-1], further, end, end[::-1]])
     rng = np.random.default_rng(seed)
     walks = []
@@ -276,10 +257,16 @@ def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: in
     return [first, *walks, turns.ravel()]
 
 
-def _in_units(table: Table, units: str) -> Table:
-    columns = {name: name for name in ("partner", "path", "time_s") if name in table}
-    for name in table.columns.difference(list(columns), sort=False):
+def _in_units(columns: Columns, units: Units) -> Table:
+    """A table of columns in um and mN, with the unit wanted in their names."""
+    import pandas as pd
+
+    arguments.choice(units, get_args(Units), "units")
+    named = {}
+    for name, values in columns.items():
+        if name.removesuffix("_max") not in SI:  # path, time_s, partner
+            named[name] = values
+            continue
         ours, si, factor = SI[name.removesuffix("_max")]
-        columns[name] = f"{name}_{si if units == 'SI' else ours}"
-        table[name] *= factor if units == "SI" else 1.0
-    return table.reindex(columns=list(columns)).rename(columns=columns)
+        named[f"{name}_{si if units == 'SI' else ours}"] = factor * values if units == "SI" else values
+    return pd.DataFrame(named)

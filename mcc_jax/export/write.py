@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from .. import arguments
 from .._errors import InputError
-from .._extras import own_version
 from .._store import json_text
+from .._version import __version__
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
 from .c_header import c_header, lammps_recipe, yade_recipe
@@ -48,19 +47,15 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
 
     It has parameters with unit and uncertainty, form of the law, its effects with equation and numbers, validity,
     formulae in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; of a particle its
-    size and shape factor. Uncertainty and provenance are those of `origin`; nothing is claimed without.
+    size and shape factor. Uncertainty and provenance are those of `origin`.
 
     References:
         Bommireddy et al. (2018), eqs. 13, 16, 23, 24.
     """
     check(law, particle)
-    form = {
-        "unloading": law.unloading.value,
-        "strain_scaling": law.strain_scaling.value,
-        "k": law.unloading.constant,
-        "n": law.unloading.stress_power,
-        "p": law.strain_scaling.power,
-    }
+    unloading, scaling = law.unloading, law.strain_scaling
+    form = {"unloading": unloading.value, "strain_scaling": scaling.value}
+    form |= {"k": unloading.constant, "n": unloading.stress_power, "p": scaling.power}
     effects = {"effects": effects_of(law)} if law.effects else {}
     signed = json.dumps({"law": form, "values": numbers(law), **effects}, sort_keys=True, separators=(",", ":"))
     parameters = {}
@@ -69,6 +64,17 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
         known = origin.estimates.get(name, {})
         parameters[name] = {"sd": None, "interval_95": None, **known, "value": value, "unit": unit}
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
+    shown = None
+    if particle is not None:
+        diameter, eta = particle.effective_diameter, law.shape_factor(particle)
+        shown = {
+            **{f"{name}_um": float(getattr(particle, name)) for name in ("D1", "D2", "D3")},
+            "effective_diameter_um": float(diameter),
+            "effective_area_um2": float(particle.effective_area),
+            "eta_p": float(eta),
+            "displacement_valid_um": TESTED_STRAIN * float(diameter / eta),
+            "from": origin.geometry,
+        }
     return {
         "schema": 1,
         "what": "loading-unloading contact law of microcrystalline cellulose particles",
@@ -80,7 +86,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
         "polynomial_MPa": {"K1": K1, "K3": K3, "K5": K5, "formula": "sigma = K1 x - K3 x^3 + K5 x^5"},
         "population": origin.population,
         "is_monotone": bool(law.is_monotone),
-        "particle": None if particle is None else _geometry(law, particle, origin),
+        "particle": shown,
         "validity": {
             "scaled_strain_max": TESTED_STRAIN,
             "stress_there_MPa": TESTED_STRAIN * (K1 - TESTED_STRAIN**2 * (K3 - TESTED_STRAIN**2 * K5)),
@@ -92,23 +98,12 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
         "units": {"stress": "MPa", "length": "um", "force": "mN"},
         "provenance": {
             "software": "mcc_jax",
-            "version": own_version(),
+            "version": __version__,
             "calibration": origin.calibration,
             "reference": "Bommireddy, Agarwal, Yettella, Tomar, Gonzalez (2018), arXiv:1812.06173",
         },
         "warnings": list(origin.warnings),
         "sha256": hashlib.sha256(signed.encode()).hexdigest(),
-    }
-
-
-def _geometry(law: MccLaw, particle: Particle, origin: Origin) -> dict[str, Any]:
-    return {
-        **{f"{name}_um": float(getattr(particle, name)) for name in ("D1", "D2", "D3")},
-        "effective_diameter_um": float(particle.effective_diameter),
-        "effective_area_um2": float(particle.effective_area),
-        "eta_p": float(law.shape_factor(particle)),
-        "displacement_valid_um": TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle)),
-        "from": origin.geometry,
     }
 
 
@@ -131,9 +126,8 @@ def write_export(
     place = arguments.file_path(folder, "folder")
     if not place.is_dir():
         raise InputError("no such folder", file=place, remedy="Make it first.")
-    names = []
-    for name, content in _files(format, law, particle, origin, seed):
-        names.append(name)
+    files = _files(format, law, particle, origin, seed)
+    for name, content in files.items():
         if isinstance(content, bytes):
             (place / name).write_bytes(content)
         elif name.endswith(".csv"):
@@ -141,37 +135,36 @@ def write_export(
         else:
             text = content if isinstance(content, str) else json_text(content)
             (place / name).write_text(text, encoding="utf-8")
-    return names
+    return list(files)
 
 
-def _files(format: str, law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Iterator[tuple[str, Any]]:
-    """Names of files, and what each of them holds: text, bytes, a table, or what JSON can."""
+def _files(format: str, law: MccLaw, particle: Particle, origin: Origin, seed: int) -> dict[str, Any]:
+    """What each file holds: text, bytes, a table, or what JSON can."""
     if format in ("c", "lammps", "yade"):
-        if format == "lammps":
-            yield "lammps.md", lammps_recipe(law, particle, origin=origin)
-        elif format == "yade":
-            yield "yade.md", yade_recipe(law, particle, origin=origin)
-        yield "mcc_law.h", c_header(law, particle, origin=origin)
-        yield "mcc_law_golden.csv", golden_table(law, particle, seed=seed, units="SI")
-        yield "mcc_law_pair_golden.csv", golden_pair_table(law, particle, seed=seed, units="SI")
-        return
-    name, more = "parameters", {}
+        recipes = {"lammps": lammps_recipe, "yade": yade_recipe}
+        return {
+            **({f"{format}.md": recipes[format](law, particle, origin=origin)} if format in recipes else {}),
+            "mcc_law.h": c_header(law, particle, origin=origin),
+            "mcc_law_golden.csv": golden_table(law, particle, seed=seed, units="SI"),
+            "mcc_law_pair_golden.csv": golden_pair_table(law, particle, seed=seed, units="SI"),
+        }
+    name, files, more = "parameters", {}, {}
     if format == "csv":
         name, tables = "master_curve", curve_tables(law, particle)
-        yield "master_curve.csv", tables.loading
-        yield "unloading_curve.csv", tables.unloading
+        files = {"master_curve.csv": tables.loading, "unloading_curve.csv": tables.unloading}
         more = {"tables": _use_of_tables(law, tables.error)}
     elif format == "jax":
-        name, files = "mcc_jax_export", {}
+        name, signed = "mcc_jax_export", {}
         for dtype in ("float64", "float32"):
             for which in signatures(law):
                 artefact = jax_artefact(law, particle, which, dtype=dtype)
-                files[f"mcc_{artefact.name}.jax_export"] = artefact.signature
-                yield f"mcc_{artefact.name}.jax_export", artefact.content
+                files[f"mcc_{artefact.name}.jax_export"] = artefact.content
+                signed[f"mcc_{artefact.name}.jax_export"] = artefact.signature
         use = "jax.export.deserialize(bytearray(Path(file).read_bytes())).call(...)"
-        more = {"artefacts": {"use": f"{use}, with the packages jax and flatbuffers", "files": files}}
-    yield f"{name}.json", {**card(law, particle, origin=origin), **more}
-    yield f"{name}_golden.csv", golden_table(law, particle, seed=seed)
+        more = {"artefacts": {"use": f"{use}, with the packages jax and flatbuffers", "files": signed}}
+    files[f"{name}.json"] = {**card(law, particle, origin=origin), **more}
+    files[f"{name}_golden.csv"] = golden_table(law, particle, seed=seed)
+    return files
 
 
 def _use_of_tables(law: MccLaw, error: float) -> dict[str, Any]:

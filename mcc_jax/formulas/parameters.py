@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._format import table, value_of
+from .._format import described, in_words, table
 from .._numerics import compiled_whole, cotangent_barrier, recompute
 from .._types import Flag, Scalar, ScalarLike, Values, scalar
 from ..arguments import finite, member, positive
@@ -61,8 +61,7 @@ class Plastic(eqx.Module):
     C3: Scalar = eqx.field(converter=_checked("the softening coefficient C3", zero=True))
     C5: Scalar = eqx.field(converter=_checked("a plastic coefficient"))
 
-    def __repr__(self) -> str:
-        return f"Plastic(C1={value_of(self.C1)}, C3={value_of(self.C3)}, C5={value_of(self.C5)})"
+    __repr__ = described()
 
     @classmethod
     def from_polynomial(cls, K1: ScalarLike, K3: ScalarLike, K5: ScalarLike) -> Plastic:
@@ -189,9 +188,9 @@ class Formulas(eqx.Module):
 
     def _rows(self) -> list[tuple[str, str]]:
         return [
-            *((name, value_of(getattr(self.plastic, name))) for name in ("C1", "C3", "C5")),
-            ("shape parameter a", value_of(self.a)),
-            ("effective modulus", value_of(self.effective_modulus, "MPa")),
+            *((name, in_words(getattr(self.plastic, name))) for name in ("C1", "C3", "C5")),
+            ("shape parameter a", in_words(self.a)),
+            ("effective modulus", in_words(self.effective_modulus, "MPa")),
             ("unloading", f"{self.unloading.value}, strain scaling {self.strain_scaling.value}"),
         ]
 

@@ -14,7 +14,7 @@ import optimistix as optx
 
 from .. import arguments
 from .._errors import InputError
-from .._format import value_of
+from .._format import in_words
 from .._numerics import forward_fill, running_max
 from .._types import Path, Scalar, Values
 from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Factors, Record, Variant, find_variant
@@ -56,8 +56,8 @@ def describe(effect: AbstractEffect) -> str:
     except InputError:
         return repr(effect)
     unit = "" if variant.unit == "-" else f" {variant.unit}"
-    others = [f"{n.name} {value_of(getattr(effect, n.name))}" for n in variant.nuisances if hasattr(effect, n.name)]
-    return ", ".join([f"{effect.label}: {variant.parameter} {value_of(effect.amplitude)}{unit}", *others])
+    others = [f"{n.name} {in_words(getattr(effect, n.name))}" for n in variant.nuisances if hasattr(effect, n.name)]
+    return ", ".join([f"{effect.label}: {variant.parameter} {in_words(effect.amplitude)}{unit}", *others])
 
 
 class Memory(eqx.Module):

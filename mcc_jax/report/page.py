@@ -8,7 +8,7 @@ import shlex
 from functools import cache
 from typing import Any
 
-from .._extras import extra, own_version
+from .._extras import extra
 from .._format import interval, listed, number, percent, plain, probability, with_sd
 from .._types import Progress
 from ..calibrate.curves import KINDS, FittedCurve
@@ -138,7 +138,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     measured_only = f"{count} particles were measured; nothing has been calibrated on them yet."
     return {
         "results": results,
-        "version": own_version(),
+        "version": __version__,
         "simulated": simulated(results),
         "sections": _sections(results, shown, checks),
         "verdict": sentences[0] if sentences else measured_only,

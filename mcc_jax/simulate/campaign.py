@@ -45,10 +45,10 @@ class HiddenEffect:
 
     Attributes:
         variant: its formula.
-        amplitude: its strength in the variant's unit; where the variant differs at random from test to test, the
-            standard deviation. The middle of the plausible range if None.
+        amplitude: its strength in the variant's unit; the standard deviation where it is random from test to test.
+            The middle of the plausible range if None.
         nuisance: nuisance parameters by name, the same in all tests; those not given take the variant's middle value,
-            or are drawn for every test where the variant says so.
+            or are random from test to test where the variant says so.
     """
 
     variant: Variant
@@ -81,49 +81,42 @@ class HiddenEffect:
         return {self.variant.parameter: self.strength, **middle, **self.nuisance}
 
     def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
-        """The effect of every test: one whose every field has a leading axis N, and its parameters by name, shape (N,).
+        """The effect with a leading axis N in every field, and its parameters by name, shape (N,), of N tests.
 
-        Each effect of a campaign has its own stream of draws, by the campaign's seed and its place among them.
+        `place` is that among the effects of a campaign, each of which has its own random numbers.
         """
         values = {name: np.full(count, value) for name, value in self.numbers.items()}
+        nuisances = {one.name: one for one in self.variant.nuisances}
         for i, name in enumerate(self.random):
             # A stream for each test: adding one leaves the others as they were.
-            sources = np.random.SeedSequence([seed, _STREAM, place, i]).spawn(count)
-            streams = [np.random.default_rng(source) for source in sources]
+            streams = np.random.SeedSequence([seed, _STREAM, place, i]).spawn(count)
+            generators = [np.random.default_rng(stream) for stream in streams]
             if name == self.variant.parameter:
-                values[name] = self.strength * np.array([rng.standard_normal() for rng in streams])
-            else:  # between the ends of the grid where it is positive, as far as is plausible otherwise
-                nuisance = next(n for n in self.variant.nuisances if n.name == name)
-                low, high = nuisance.plausible
-                share = np.array([rng.random() for rng in streams])
-                if low > 0:
-                    low, high = min(nuisance.grid), max(nuisance.grid)
-                    values[name] = low * (high / low) ** share
-                else:
-                    values[name] = low + (high - low) * share
-
-        def build(numbers: dict[str, Array]) -> AbstractEffect:
-            return self.variant.build(numbers.pop(self.variant.parameter), **numbers)
-
-        arrays = {name: jnp.asarray(drawn, dtype=float) for name, drawn in values.items()}
-        return eqx.filter_vmap(build)(arrays), values
+                values[name] = self.strength * np.array([rng.standard_normal() for rng in generators])
+                continue
+            share = np.array([rng.random() for rng in generators])
+            low, high = nuisances[name].plausible
+            if low > 0:  # evenly in the logarithm, between the ends of the grid
+                low, high = min(nuisances[name].grid), max(nuisances[name].grid)
+                values[name] = low * (high / low) ** share
+            else:
+                values[name] = low + (high - low) * share
+        arrays = {name: jnp.asarray(value, dtype=float) for name, value in values.items()}
+        return eqx.filter_vmap(self.variant.build)(arrays.pop(self.variant.parameter), **arrays), values
 
     @property
     def random(self) -> tuple[str, ...]:
-        """Names of the parameters that every test draws for itself."""
+        """Names of the parameters that differ at random from test to test."""
         names = [self.variant.parameter] if self.variant.random_per_test else []
         names += [n.name for n in self.variant.nuisances if n.random_per_test and n.name not in self.nuisance]
         return tuple(names)
 
     def describe(self) -> dict[str, Any]:
         """For the campaign's metadata."""
-        drawn = [name for name in self.random if name != self.variant.parameter]
-        return {
-            "mechanism": self.variant.mechanism,
-            "variant": self.variant.name,
-            **{name: float(value) for name, value in self.numbers.items() if name not in drawn},
-            "random_per_test": list(self.random),
-        }
+        fixed = {name: float(value) for name, value in self.numbers.items() if name not in self.random}
+        amplitude = {self.variant.parameter: float(self.strength)}  # of a random one the standard deviation
+        formula = {"mechanism": self.variant.mechanism, "variant": self.variant.name}
+        return {**formula, **amplitude, **fixed, "random_per_test": list(self.random)}
 
 
 def read_effect(text: str) -> HiddenEffect:
@@ -156,9 +149,8 @@ def paper_law(
     unloading: Unloading | str = Unloading.PRINTED, strain_scaling: StrainScaling | str = StrainScaling.RAW
 ) -> MccLaw:
     """The paper's mean law: a = 1.43, effective modulus 16 GPa (which belongs to the printed form)."""
-    return MccLaw(
-        paper_population().mean_law, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling
-    )
+    plastic = paper_population().mean_law
+    return MccLaw(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
 
 
 def draw_plastic(count: int, seed: int, *, shared: bool) -> Plastic:
@@ -214,16 +206,14 @@ def simulate_campaign(
 
     Args:
         laws: one law per particle, every array field with a leading axis N (`law_for_each`), with or without effects.
-        diameters_um: D1, D2, D3 [um], shape (N, 3).
+        diameters_um: D1, D2, D3, shape (N, 3).
         peaks: each particle's peak, force [mN] under load control or displacement [um], shape (N,), > 0.
         programme: what the instrument does, relative to the peak.
         instrument: how it reads; perfect if None.
         particles: names; "1" to "N" if None.
-        effects: what acts in addition to the law; strengths that differ from test to test are drawn with the seed,
-            and are in `columns`.
+        effects: what acts in addition to the law; parameters that are random from test to test are in `columns`.
         relative_humidity_percent: of the room during each test, shape (N,); it becomes a column.
-        seed: seed of the read-out's noise and of the effects. Each particle has its own stream: adding one leaves the
-            others as they were.
+        seed: of noise and effects. Each particle has its own stream: adding one leaves the others as they were.
         provenance: for the campaign's metadata.
 
     Returns:
@@ -254,16 +244,9 @@ def simulate_campaign(
         for rows in zip(*samples, strict=True)
     )
     drawn = [effect.draw(seed, i, count) for i, effect in enumerate(effects)]
-    acting = laws.with_effects(*(effect for effect, _ in drawn))
-    batch = particle_batch(diameters_um)
-    response = simulate_batch(
-        acting,
-        batch,
-        paths,
-        times=times if acting.effects else None,
-        relative_humidity=humidity if acting.effects else None,
-        control=programme.control,
-    )
+    acting, batch = laws.with_effects(*(effect for effect, _ in drawn)), particle_batch(diameters_um)
+    surroundings = {"times": times, "relative_humidity": humidity} if acting.effects else {}
+    response = simulate_batch(acting, batch, paths, control=programme.control, **surroundings)
     force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
@@ -274,12 +257,11 @@ def simulate_campaign(
         Curve(time, *instrument.read(rng, force[i, : len(time)], displacement[i, : len(time)]))
         for i, ((time, _), rng) in enumerate(zip(samples, streams, strict=True))
     ]
-    truth = {name: getattr(laws.plastic, name) for name in ("C1", "C3", "C5")}
+    numbers: dict[str, Any] = {f"true_{name}": getattr(laws.plastic, name) for name in ("C1", "C3", "C5")}
     mechanisms = [effect.variant.mechanism for effect in effects]
     for i, (effect, (_, values)) in enumerate(zip(effects, drawn, strict=True)):
         mark = "" if mechanisms.count(mechanisms[i]) == 1 else f"_{i + 1}"
-        truth |= {f"{mechanisms[i]}{mark}_{name}": values[name] for name in effect.random}
-    numbers = {f"true_{name}": values for name, values in truth.items()}
+        numbers |= {f"true_{mechanisms[i]}{mark}_{name}": values[name] for name in effect.random}
     if relative_humidity_percent is not None:
         numbers[HUMIDITY_COLUMN] = humidity
     columns = {name: tuple(repr(float(v)) for v in np.asarray(values, float)) for name, values in numbers.items()}
@@ -290,9 +272,7 @@ def simulate_campaign(
         "effective_modulus_MPa": float(np.asarray(laws.effective_modulus).ravel()[0]),
         "unloading": laws.unloading.value,
         "strain_scaling": laws.strain_scaling.value,
-        "displacement_noise_um": instrument.displacement_noise_um,
-        "force_noise_mN": instrument.force_noise_mN,
-        "zero_um": instrument.zero_um,
+        **{name: getattr(instrument, name) for name in ("displacement_noise_um", "force_noise_mN", "zero_um")},
     }
     if effects:
         simulation["effects"] = [effect.describe() for effect in effects]
@@ -313,9 +293,9 @@ def _humidity(values: Any, effects: Sequence[HiddenEffect], count: int) -> np.nd
         if needs:
             raise InputError(f"the effect {needs[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
         return np.full(count, REFERENCE_HUMIDITY_PERCENT)
-    found = arguments.floats(values, HUMIDITY_COLUMN, shape="one number from 0 to 100 for every test")
+    must = f"{count} numbers from 0 to 100, one for every test"
+    found = arguments.floats(values, HUMIDITY_COLUMN, shape=must)
     if found.shape != (count,) or not ((found >= 0) & (found <= 100)).all():
-        must = f"{count} numbers from 0 to 100, one for every test"
         raise InputError(f"{HUMIDITY_COLUMN} must be {must}, got {arguments.shown(found.tolist())}")
     return found
 
@@ -334,9 +314,8 @@ def paper_campaign(
 ) -> Campaign:
     """A campaign drawn from the paper: Table 1's particles, Table 2's coefficients, its protocol.
 
-    The paper publishes no measured curve as numbers; this is what its law says such a campaign looks like. Maximum
-    stresses are drawn evenly from the published range. Of draws from Table 2, 2.4 % are not monotone; they are kept,
-    snap through under load control and are marked in the column `true_monotone`.
+    The paper publishes no measured curve as numbers. Maximum stresses are drawn evenly from the published range. Of
+    draws from Table 2, 2.4 % are not monotone; they snap through under load control, and `true_monotone` marks them.
 
     Args:
         seed: seed of coefficients, peaks and noise.
@@ -345,9 +324,8 @@ def paper_campaign(
         programme: what the instrument does; one cycle at 2 mN/s if None.
         unloading: form of the unloading law (16 GPa belongs to the printed one).
         strain_scaling: how the shape factor enters unloading.
-        peak_stress_MPa: range of the maximum stress [MPa].
-        effects: as of `simulate_campaign`.
-        relative_humidity_percent: as of `simulate_campaign`.
+        peak_stress_MPa: range of the maximum stress.
+        effects, relative_humidity_percent: as of `simulate_campaign`.
     """
     seed = arguments.seed(seed)
     programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme

@@ -58,19 +58,17 @@ def drive(
     Args:
         law: any contact law, with or without effects.
         particle: size and shape; several at once: `simulate_batch`, or `equinox.filter_vmap`.
-        path: what the instrument imposes, displacements [um] or forces [mN], shape (n,); negative values are out of
-            contact.
-        time: times [s] of the path; a law with effects needs them, others know no time.
-        control: which of the two `path` is, "displacement" or "load".
+        path: displacements or forces, shape (n,); negative ones are out of contact.
+        time: times [s] of the path, for a law with effects only.
+        control: what `path` is, "displacement" or "load".
         state: the state to start from; a virgin particle if None.
         throw: raise if the result is not successful; otherwise hand the reason back in `result`. Pass False inside a
             sampler's model or a solver, which may propose parameters without sense: raised there, it ends the run.
 
     Raises:
-        InputError: for arguments that are unfit; with `throw`, naming effects and strain, if the particle would gain
-            energy.
-        EquinoxRuntimeError: with `throw`, if anything in the response is not finite or the particle can carry no
-            stress; within compiled code also if the particle would gain energy.
+        InputError: for unfit arguments; with `throw`, naming effects and strain, if the particle would gain energy.
+        EquinoxRuntimeError: with `throw`, if the response is not finite or the particle can carry no stress; within
+            compiled code also if it would gain energy.
     """
     arguments.choice(control, get_args(Control), "control")
     path = arguments.path(path, "path", many="Several particles at once: simulate_batch, or equinox.filter_vmap.")
@@ -132,9 +130,7 @@ def simulate_batch(
     relative_humidity: Any = None,
     control: Control = "displacement",
 ) -> Response:
-    """`drive` for N particles at once, each with its own law.
-
-    What the law makes of its parameters never raises: look at `result` and `monotone`.
+    """`drive` for N particles at once, each with its own law; what it cannot drive it marks in `result`.
 
     Args:
         laws: a law whose every array field has a leading axis N.
@@ -142,7 +138,7 @@ def simulate_batch(
         paths: displacements [um] or forces [mN], shape (N, steps); pad shorter paths by repeating their last value.
         times: times [s], likewise, for laws with effects.
         relative_humidity: of every test [%], shape (N,), for laws with effects; the reference if None.
-        control: "displacement" or "load".
+        control: what `paths` are, "displacement" or "load".
 
     Returns:
         A response with a leading axis N in every field.
@@ -157,13 +153,9 @@ def simulate_batch(
         raise InputError(f"paths must have the shape (N, steps), got {paths.shape}", remedy=remedy)
     times = None if times is None else arguments.values(times, "times")
     humidity = None if relative_humidity is None else arguments.values(relative_humidity, "relative_humidity")
-    count = paths.shape[:1]
-    for name, batch, shape in (
-        ("laws", laws, count),
-        ("particles", particles, count),
-        ("times", times, paths.shape),
-        ("relative_humidity", humidity, count),
-    ):
+    batches = {"laws": laws, "particles": particles, "times": times, "relative_humidity": humidity}
+    for name, batch in batches.items():
+        shape = paths.shape if name == "times" else paths.shape[:1]
         for leaf in jax.tree.leaves(eqx.filter(batch, eqx.is_array)):
             if leaf.shape[: len(shape)] != shape:
                 problem = f"paths have the shape {paths.shape}, and an array of {name} has {leaf.shape}"

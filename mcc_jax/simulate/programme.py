@@ -21,7 +21,7 @@ class Ramp:
 
     Attributes:
         to: level as a share of the particle's peak; 1 is the peak, 0 full release.
-        rate: magnitude of the rate, mN/s under load control, um/s under displacement control, > 0.
+        rate: mN/s under load control, um/s under displacement control, > 0.
     """
 
     to: float
@@ -35,11 +35,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Hold:
-    """Stay where you are.
-
-    Attributes:
-        seconds: how long [s], > 0.
-    """
+    """Stay where you are for so many seconds, > 0."""
 
     seconds: float
 
@@ -68,9 +64,9 @@ class Programme:
     def __post_init__(self) -> None:
         if (self.interval_s is None) == (self.points is None):
             raise InputError("give exactly one of interval_s and points")
-        if self.interval_s is not None:
+        if self.points is None:
             object.__setattr__(self, "interval_s", arguments.number(self.interval_s, "interval_s", above=0))
-        if self.points is not None:
+        else:
             object.__setattr__(self, "points", arguments.whole(self.points, "points", least=2))
         arguments.choice(self.control, get_args(Control), "control")
         if not self.steps:
@@ -80,13 +76,10 @@ class Programme:
     def __repr__(self) -> str:
         unit = "mN/s" if self.control == "load" else "um/s"
         sampling = f"every {self.interval_s} s" if self.points is None else f"{self.points} samples"
-        steps = [
-            f"hold {number(step.seconds)} s"
-            if isinstance(step, Hold)
-            else f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"
-            for step in self.steps
-        ]
-        rows = [(str(i), text) for i, text in enumerate(steps, start=1)]
+        rows = []
+        for i, step in enumerate(self.steps, start=1):
+            hold = f"hold {number(step.seconds)} s" if isinstance(step, Hold) else None
+            rows.append((str(i), hold or f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"))
         return table(f"Programme under control of {self.control}, {sampling}", rows)
 
     @classmethod
@@ -109,24 +102,21 @@ class Programme:
             rate: loading rate [mN/s or um/s]; the paper's tests ran at 2 mN/s.
             levels: shares of the particle's peak, one per cycle.
             unload_to: share of the peak at which reloading starts.
-            hold_s: hold at every level [s].
+            hold_s: hold at every level.
             unload_rate: rate of unloading; `rate` if None.
-            interval_s: time between two samples [s].
-            points: number of samples; 300 if neither is given.
+            interval_s, points: as of `Programme`; 300 points if neither is given.
         """
         levels = arguments.floats(levels, "levels", shape="a list of shares of the peak").ravel().tolist()
         hold_s = arguments.number(hold_s, "hold_s", least=0)
         unload_to = arguments.number(unload_to, "unload_to, a share of the peak,", least=0)
         back = rate if unload_rate is None else unload_rate
+        hold = [Hold(hold_s)] if hold_s else []
         steps: list[Ramp | Hold] = []
-        for i, level in enumerate(levels):
-            steps.append(Ramp(level, rate))
-            if hold_s:
-                steps.append(Hold(hold_s))
-            steps.append(Ramp(unload_to if i + 1 < len(levels) else 0.0, back))
+        for i, level in enumerate(levels, start=1):
+            steps += [Ramp(level, rate), *hold, Ramp(unload_to if i < len(levels) else 0.0, back)]
         if interval_s is None and points is None:
             points = 300
-        return cls(control, tuple(steps), interval_s, points)
+        return cls(control, steps, interval_s, points)
 
     def sample(self, peak: float) -> tuple[np.ndarray, np.ndarray]:
         """Times [s], strictly increasing, and target values (mN or um) for a particle whose peak is `peak`.
@@ -136,11 +126,8 @@ class Programme:
         peak = arguments.number(peak, "the peak of a particle [mN or um]", above=0)
         times, values = [0.0], [0.0]
         for step in self.steps:
-            if isinstance(step, Hold):
-                duration, value = step.seconds, values[-1]
-            else:
-                value = step.to * peak
-                duration = abs(value - values[-1]) / step.rate
+            value = values[-1] if isinstance(step, Hold) else step.to * peak
+            duration = step.seconds if isinstance(step, Hold) else abs(value - values[-1]) / step.rate
             # A billionth of the time so far is no step: rounding of the times alone would change its rate. Nor is a
             # picosecond at the beginning: sampled, it would fall below the smallest number.
             if duration > max(1e-9 * times[-1], 1e-12):
@@ -148,7 +135,7 @@ class Programme:
                 values.append(value)
         if len(times) < 2:
             raise InputError("the programme never leaves zero")
-        interval = self.interval_s if self.interval_s is not None else times[-1] / ((self.points or 2) - 1)
+        interval = self.interval_s or times[-1] / ((self.points or 2) - 1)
         grid = np.arange(0.0, times[-1], interval)
         # A grid point that falls onto a turning point but for rounding would make two samples of one.
         near = np.abs(grid[:, None] - np.asarray(times)[None, :]).min(axis=1) < 1e-6 * interval
@@ -161,11 +148,9 @@ class Instrument:
     """Read-out of an instrument; the default is perfect.
 
     Attributes:
-        displacement_noise_um: standard deviation of white noise on displacement [um].
-        force_noise_mN: standard deviation of white noise on force [mN].
-        displacement_resolution_um: smallest step of displacement [um]; 0 for none.
-        force_resolution_mN: smallest step of force [mN]; 0 for none.
-        zero_um: standard deviation of each test's zero of displacement [um]: where the instrument found contact.
+        displacement_noise_um, force_noise_mN: standard deviation of white noise.
+        displacement_resolution_um, force_resolution_mN: smallest step of the read-out; 0 for none.
+        zero_um: standard deviation of each test's zero of displacement, where the instrument found contact.
     """
 
     displacement_noise_um: float = 0.0
