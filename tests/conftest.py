@@ -19,8 +19,7 @@ hypothesis.settings.load_profile("repository")
 def pytest_configure(config):
     """What is compiled is kept for later modules, notebooks and commands, until this run ends, or in the folder given.
 
-    All workers share one folder, which the first process makes. JAX locks a folder that is limited in size; otherwise
-    one process might read half of what another is writing.
+    All workers share one folder, limited in size, since JAX locks only such a folder while it writes.
     """
     _keep_everything()
     if hasattr(config, "workerinput"):
@@ -41,13 +40,10 @@ def pytest_configure(config):
 
 
 def _keep_everything():
-    """With a limited size JAX reads the age of every file before it adds one: with thousands, longer than compiling.
-
-    What all tests compile is a hundredth of the limit.
-    """
+    """With a limited size JAX reads the age of every file before it adds one, which takes longer than compiling."""
     try:
         from jax._src.lru_cache import LRUCache
-    except ImportError:  # not public: another version of JAX keeps its own way, and the tests only take longer
+    except ImportError:  # not public: with another version of JAX the tests may take longer
         return
     LRUCache._evict_if_needed = lambda self, **_: None
 
@@ -63,14 +59,13 @@ GROUPS = {
     "law": ("tests/law/",),
     "dem": ("tests/dem/",),
 }
-"""Files that run on one worker, one after the other, since they compile the same functions."""
+"""Files that run on one worker, one after the other, since they compile the same functions; others by file."""
 
 FIRST = ("discover", "calibrate", "posterior", "tests/cli/", "tests/plots/")
 """The longest first: begun last, they would keep one worker busy while the other waits."""
 
 
 def group_of(nodeid):
-    """The group of a test, or else its file."""
     file = nodeid.split("::")[0]
     return next((group for group, starts in GROUPS.items() if file.startswith(starts)), file)
 
@@ -96,8 +91,9 @@ EVERY_CASE = (
 """Readers and errors: each case is another one, and takes milliseconds."""
 
 
-def mark_further_cases(items):
-    """The core has the first case of a test with several cases."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """The core has the first case of a test with several cases. Tests of one group are together, the longest first."""
     seen = set()
     for item in items:
         test = item.nodeid.split("[")[0]
@@ -106,12 +102,6 @@ def mark_further_cases(items):
         if test in seen:
             item.add_marker(pytest.mark.extended)
         seen.add(test)
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """Before tests are selected by their marks. Tests of one group stand together, the longest first."""
-    mark_further_cases(items)
 
     def place(item):
         group = group_of(item.nodeid)

@@ -49,9 +49,9 @@ def clipped(campaign, share, *, only=None, channel="force"):
     """A channel that reads no more than a share of its true largest value."""
 
     def change(time, force, path):
-        if channel == "force":
-            return time, np.minimum(force, share * force.max()), path
-        return time, force, np.minimum(path, share * path.max())
+        values = force if channel == "force" else path
+        np.minimum(values, share * values.max(), out=values)
+        return time, force, path
 
     return changed(campaign, change, only=only)
 
@@ -112,10 +112,7 @@ def noisy(tests, seed, noise_um=0.05, noise_mN=0.05):
     rng = np.random.default_rng(seed)
 
     def change(time, force, path):
-        return (
-            time,
-            force + noise_mN * rng.standard_normal(len(force)),
-            path + noise_um * rng.standard_normal(len(path)),
-        )
+        noise = rng.standard_normal((2, len(time)))
+        return time, force + noise_mN * noise[0], path + noise_um * noise[1]
 
     return changed(tests, change)

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 
-import jax.numpy as jnp
+import equinox as eqx
 import msgspec
 import numpy as np
 import pytest
@@ -53,11 +53,8 @@ def test_what_is_read_is_what_was_written(tmp_path_factory, value):
 def test_laws_with_effects_and_memory(tmp_path):
     law = paper_law(Unloading.PUNCH).with_effects("creep:logarithmic", "damage")
     found = again(law, tmp_path)
-    assert type(found) is type(law)
     assert found.unloading is Unloading.PUNCH
-    assert [effect.name for effect in found.effects] == ["creep:logarithmic", "damage:exponential"]
-    assert float(found.effects[0].amplitude) == float(law.effects[0].amplitude)
-    assert isinstance(found.plastic.C1, jnp.ndarray)
+    assert eqx.tree_equal(found, law)
 
 
 def damaged(file, change):
@@ -75,7 +72,7 @@ DAMAGE = {
     "empty": (written(lambda _: b""), "cut off"),
     "no text": (written(lambda raw: raw.replace(b"mcc_jax result", b"mcc_jax \xff\xfesult")), "no result"),
     "newer": (lambda file: damaged(file, {"version": 2, "written_by": "9.1.0"}), "newer version, 9.1.0"),
-    "another format": (lambda file: damaged(file, {"format": "another"}), "something else"),
+    "another format": (lambda file: damaged(file, {"format": "another"}), "no result of mcc_jax"),
     "changed": (lambda file: damaged(file, {"content": b"\x90"}), "checksum"),
 }
 
@@ -86,11 +83,8 @@ def test_a_damaged_foreign_or_newer_file_is_one_line(tmp_path, kind):
     file = tmp_path / "discovery.msgpack"
     file.write_bytes(encode(Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 0.0)))
     change(file)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=f"{file}.*{words}"):
         load(tmp_path)
-    assert words in str(caught.value)
-    assert str(file) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 class Mine(AbstractEffect):
@@ -123,5 +117,5 @@ def test_a_field_that_nobody_knows_is_another_version(tmp_path):
     Stranger.__module__, Stranger.__qualname__ = Discovery.__module__, Discovery.__qualname__
     file = tmp_path / "calibration.msgpack"
     file.write_bytes(encode(Stranger("NO_GAP")))
-    with pytest.raises(InputError, match="no field 'more'"):
+    with pytest.raises(InputError, match=r"another version.*\bmore\b"):
         load(tmp_path)

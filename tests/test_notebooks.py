@@ -9,11 +9,9 @@ from run_notebooks import LARGEST, LARGEST_NOTEBOOK, NOTEBOOKS, executed
 
 NUMBER = re.compile(r"(?<![\w.])[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 CLOSE, NEAR_ZERO, NOTHING = 0.05, 1e-3, 1e-6
-"""How far a number may be from the kept one: five per cent, a thousandth of the largest beside it, one in its last
-decimal place, or, of what should be zero, a millionth.
-
-On one machine they are the same to the last digit. Another processor adds in another order, which moves where an
-optimiser stops and, by a few per cent, what is left near zero.
+"""How far a number may be from the stored one: five per cent, a thousandth of the largest in its line, one in its last
+decimal place, or, of what should be zero, a millionth. Another processor adds in another order, which moves where an
+optimiser stops.
 """
 
 
@@ -40,9 +38,9 @@ def differences(kept, again):
     """Cells whose words differ, or whose numbers do by more than they may."""
     found = []
     for (i, one), (_, two) in zip(printed(kept), printed(again), strict=True):
-        words = [" ".join(NUMBER.sub("#", text).split()) for text in (one, two)]
-        if words[0] != words[1]:
-            found.append(f"cell {i}: {words[0][:200]!r} is now {words[1][:200]!r}")
+        words, others = (" ".join(NUMBER.sub("#", text).split()) for text in (one, two))
+        if words != others:
+            found.append(f"cell {i}: {words[:200]!r} is now {others[:200]!r}")
             continue
         for line, other in zip(one.splitlines(), two.splitlines(), strict=False):
             if any(_apart(*pair, line) for pair in zip(NUMBER.findall(line), NUMBER.findall(other), strict=False)):
@@ -88,9 +86,8 @@ def test_notebook_gives_its_results_again(notebook):
 
 def test_a_drifted_result_is_seen():
     def notebook(text):
-        return nbformat.v4.new_notebook(
-            cells=[nbformat.v4.new_code_cell("", outputs=[nbformat.v4.new_output("stream", text=text)])]
-        )
+        output = nbformat.v4.new_output("stream", text=text)
+        return nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("", outputs=[output])])
 
     kept = notebook("a = 1.4289 ± 0.0012, verdict NAMED, gap 2e-16")
     assert differences(kept, notebook("a = 1.4291 ± 0.0012, verdict NAMED, gap 5e-16")) == []

@@ -25,8 +25,7 @@ def test_positive_pow_vanishes_with_its_derivatives(dtype, mode, power, x):
     x = jnp.array(x, dtype)
     function = lambda x: positive_pow(x, power)  # noqa: E731
     for order in (function, mode(function), mode(mode(function))):
-        assert order(x) == 0
-        assert order(x).dtype == dtype
+        np.testing.assert_array_equal(order(x), dtype(0), strict=True)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -38,14 +37,11 @@ def test_positive_pow_is_the_power_above_zero(mode):
     np.testing.assert_array_equal(mode(positive_pow, 1)(jnp.array(0.0), p), 0)
 
 
-PATHS = hnp.arrays(np.float64, st.just(12), elements=st.integers(-3, 3).map(float))
-
-
 jacobians = [jax.jit(mode(running_max)) for mode in MODES]
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(path=PATHS)
+@settings(max_examples=60)
+@given(path=hnp.arrays(np.float64, st.just(12), elements=st.integers(-3, 3).map(float)))
 def test_running_max_passes_a_tie_to_the_earliest_whole(path):
     np.testing.assert_array_equal(largest_so_far(jnp.asarray(path)), np.maximum.accumulate(path))
     expected = np.zeros((12, 12))
@@ -111,9 +107,7 @@ def test_two_thirds_power_is_exact_to_rounding(dtype):
 
 
 def test_two_thirds_power_at_the_ends():
-    x = jnp.asarray([0.0, 5e-324, 1e-310, 1e-40, 1.0, jnp.nan])
-    got = np.asarray(two_thirds_power(x))
-    assert (got[:4] <= np.asarray(x)[:4] ** (2 / 3) + 1e-300).all()
-    assert (got[:4] >= 0).all()
-    assert got[4] == 1
-    assert np.isnan(got[5])
+    x = np.array([0.0, 5e-324, 1e-310, 1e-40])
+    got = np.asarray(two_thirds_power(jnp.asarray([*x, 1.0, jnp.nan])))
+    assert ((got[:4] >= 0) & (got[:4] <= x ** (2 / 3) + 1e-300)).all()
+    np.testing.assert_array_equal(got[4:], [1, np.nan])

@@ -60,13 +60,10 @@ def some():
     response = mcc.drive(law, particle, path)
     tests = mcc.paper_campaign(0, programme=mcc.Programme.cycles(points=60))
     side = dem.half_contact(law, particle)
-    packing = dem.spheres(law, np.array([100.0, 120.0]), density=1540.0)
     return {
         "law": law,
         "law with effects": law.with_effects("creep:logarithmic", "frame_compliance"),
-        "particle": particle,
-        "particles": jax.vmap(mcc.Particle)(*jnp.full((3, 5), 100.0)),
-        "population": mcc.simulate.paper_population(),
+        "batch": jax.vmap(mcc.Particle)(*jnp.full((3, 5), 100.0)),
         "response": response,
         "energy": law.energy(particle, response.state, path[-1]),
         "library": mcc.LIBRARY,
@@ -77,8 +74,6 @@ def some():
         "instrument": mcc.Instrument(displacement_noise_um=0.02),
         "campaign": tests,
         "curve": tests.curves[0],
-        "metadata": tests.metadata,
-        "segment": mcc.campaign.find_segments(tests.curves[0])[0],
         "adjustment": mcc.adjust(tests),
         "tests": mcc.calibrate.select_tests(tests),
         "record": effects.clean_record(jnp.linspace(0, 10, 20), jnp.linspace(0, 10, 20)),
@@ -86,24 +81,21 @@ def some():
         "priors": mcc.Priors(),
         "decisions": discovery.DECISIONS,
         "plan": mcc.discovery.Plan("a plan", [mcc.Programme.cycles()]),
-        "side": side,
-        "packing": packing,
+        "packing": dem.spheres(law, np.array([100.0, 120.0]), density=1540.0),
         "walls": dem.die(1e-3, 2e-3)[-1],
         "motion": dem.Motion.of(time_step=1e-8, drag=0.0),
-        "solver": dem.Solver(),
         "pair": dem.pair_energy(side, side, jnp.asarray(2e-5), jnp.asarray(2e-5)),
         "artefact": export.jax_artefact(law, particle),
-        "origin": export.Origin(),
     }
 
 
-def test_what_is_made_in_a_moment_is_told_in_a_few_lines(some):
+def test_what_is_made_in_a_moment_takes_a_few_lines(some):
     for thing in some.values():
         check(thing)
 
 
 @pytest.mark.extended
-def test_calibrations_and_what_they_return_are_told_in_a_few_lines(paper_posterior):
+def test_calibrations_and_what_they_return_take_a_few_lines(paper_posterior):
     posterior = paper_posterior
     curves = mcc.predict_new_particle(posterior, (200.0, 190.0, 160.0), force_mN=posterior.campaign.curves[0].force_mN)
     squares = mcc.least_squares(posterior.campaign)
@@ -124,11 +116,11 @@ def test_a_law_shows_values_with_units(some):
     assert "successful" in repr(some["response"])
 
 
-def test_what_jax_traces_is_told_too():
-    told = []
-    jax.jit(lambda law: told.append(repr(law)) or law.a)(mcc.paper_law())
-    jax.jit(lambda energy: told.append(repr(energy)) or energy.work)(mcc.law.Energy(*jnp.ones(3)))
-    assert all(len(text.splitlines()) <= MOST_LINES for text in told)
+def test_what_jax_traces_is_printed_too():
+    printed = []
+    jax.jit(lambda law: printed.append(repr(law)) or law.a)(mcc.paper_law())
+    jax.jit(lambda energy: printed.append(repr(energy)) or energy.work)(mcc.law.Energy(*jnp.ones(3)))
+    assert all(len(text.splitlines()) <= MOST_LINES for text in printed)
 
 
 IN_WORDS = [

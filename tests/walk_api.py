@@ -20,10 +20,10 @@ import mcc_jax as mcc  # noqa: E402
 from mcc_jax import calibrate, campaign, dem, effects, export, simulate  # noqa: E402
 
 
-def outcome(call, *args, **kwargs) -> str:
+def outcome(call, **arguments) -> str:
     """ "refused: " and the message, "accepted", or the error that should have been an `InputError`."""
     try:
-        call(*args, **kwargs)
+        call(**arguments)
     except mcc.InputError as error:
         return f"refused: {error}"
     except Exception as error:  # noqa: BLE001: whatever else a user would see is what is looked for
@@ -34,14 +34,14 @@ def outcome(call, *args, **kwargs) -> str:
 class Example:
     """A valid call: the function or class, and its arguments by name.
 
-    Numbers in `signed` may be negative. Only if `run` is the valid call carried out, to compare lists and Series.
+    Numbers in `signed` may be negative. Only with `run` is the valid call run, to compare lists and Series.
     """
 
     def __init__(self, call, *, signed=(), run=True, **given):
         self.call, self.given, self.signed, self.run = call, given, signed, run
 
 
-def examples(folder: Path) -> dict[str, Example]:
+def examples(folder: Path) -> list[Example]:
     """One call of everything that takes numbers, options or arrays."""
     the_law, particle = mcc.paper_law(), mcc.Particle(150.0, 130.0, 120.0)
     path = np.linspace(0.0, 20.0, 8)
@@ -55,81 +55,71 @@ def examples(folder: Path) -> dict[str, Example]:
     programme = mcc.Programme.cycles()
     heights = np.linspace(2e-4, 1.9e-4, 3)
     packing = dem.spheres(the_law, [1e-4, 1.2e-4])
-    return {
-        "Particle": Example(mcc.Particle, D1=150.0, D2=130.0, D3=120.0),
-        "Plastic": Example(mcc.Plastic, C1=7.0, C3=27.0, C5=140.0, signed=("C3",)),
-        "LogNormal": Example(mcc.law.LogNormal, mean=2.0, sd=0.3, signed=("mean",)),
-        "MccLaw": Example(mcc.MccLaw, plastic=mcc.Plastic(7.0, 27.0, 140.0), a=1.4, effective_modulus=1.6e4,
-            signed=("a",), unloading="printed", strain_scaling="raw"),
-        "paper_law": Example(mcc.paper_law, unloading="printed", strain_scaling="raw"),
-        "drive": Example(mcc.drive, law=the_law, particle=particle, path=path, control="displacement"),
-        "simulate_batch": Example(mcc.simulate.simulate_batch, laws=laws, particles=campaign.particle_batch(sizes),
-            paths=np.stack([path] * 3), control="displacement"),
-        "simulate_campaign": Example(mcc.simulate_campaign, laws=laws, diameters_um=sizes, peaks=peaks,
-            programme=programme, seed=1, run=False),
-        "paper_campaign": Example(mcc.paper_campaign, seed=0, unloading="printed", strain_scaling="raw", run=False),
-        "Ramp": Example(mcc.Ramp, to=1.0, rate=20.0, signed=("to",)),
-        "Hold": Example(mcc.Hold, seconds=20.0),
-        "Programme": Example(mcc.Programme, control="load", steps=[mcc.Ramp(1.0, 20.0)], interval_s=0.1),
-        "Programme.cycles": Example(mcc.Programme.cycles, control="load", rate=2.0, unload_to=0.0, hold_s=1.0,
-            unload_rate=1.0, interval_s=0.1),
-        "Instrument": Example(mcc.Instrument, displacement_noise_um=0.1, force_noise_mN=0.1,
-            displacement_resolution_um=0.1, force_resolution_mN=0.1, zero_um=0.1, signed=("zero_um",)),
-        "read_effect": Example(simulate.read_effect, text="creep:logarithmic=0.02"),
-        "find_variant": Example(effects.find_variant, name="creep"),
-        "Curve": Example(mcc.Curve, time_s=curve.time_s, force_mN=curve.force_mN,
-            displacement_um=curve.displacement_um),
-        "Campaign": Example(mcc.Campaign, particles=["a"], diameters_um=np.full((1, 3), 100.0), curves=[curve]),
-        "Metadata": Example(mcc.campaign.Metadata, control="load", force_resolution_mN=0.1, punch_diameter_um=500.0),
-        "Segment": Example(mcc.campaign.Segment, kind="load", start=0, stop=4),
-        "find_segments": Example(mcc.campaign.find_segments, curve=tests.curves[0], control="load"),
-        "adjust": Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
-        "strain_table": Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
-        "fit_shape_parameter": Example(calibrate.fit_shape_parameter, table=table, objective="full"),
-        "Model": Example(mcc.Model, unloading="printed", strain_scaling="raw", modulus_scatter=False,
-            shape_scatter=False),
-        "LogNormalPrior": Example(mcc.calibrate.LogNormalPrior, median=6.0, log_sd=0.5),
-        "NormalPrior": Example(mcc.calibrate.NormalPrior, mean=1.0, sd=1.0, signed=("mean",)),
-        "NakagamiPrior": Example(mcc.calibrate.NakagamiPrior, sd=0.3, shape=0.5),
-        "calibrate_paper": Example(mcc.calibrate_paper, campaign=tests, threshold_MPa=0.2, objective="full",
-            unloading="printed", strain_scaling="raw", seed=0, run=False),
-        "least_squares": Example(mcc.least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0,
+    return [
+        Example(mcc.Particle, D1=150.0, D2=130.0, D3=120.0),
+        Example(mcc.Plastic, C1=7.0, C3=27.0, C5=140.0, signed=("C3",)),
+        Example(mcc.law.LogNormal, mean=2.0, sd=0.3, signed=("mean",)),
+        Example(mcc.MccLaw, plastic=mcc.Plastic(7.0, 27.0, 140.0), a=1.4, effective_modulus=1.6e4, signed=("a",),
+            unloading="printed", strain_scaling="raw"),
+        Example(mcc.paper_law, unloading="printed", strain_scaling="raw"),
+        Example(mcc.drive, law=the_law, particle=particle, path=path, control="displacement"),
+        Example(mcc.simulate.simulate_batch, laws=laws, particles=campaign.particle_batch(sizes),
+            paths=np.tile(path, (3, 1)), control="displacement"),
+        Example(mcc.simulate_campaign, laws=laws, diameters_um=sizes, peaks=peaks, programme=programme, seed=1,
             run=False),
-        "sample": Example(mcc.sample, campaign=tests, threshold_MPa=0.2, mode="fast", chains=4, warmup=300, draws=1000,
-            seed=0, run=False),
-        "calibrate_many": Example(mcc.calibrate_many, campaigns=[tests], method="least_squares", threshold_MPa=0.2,
+        Example(mcc.paper_campaign, seed=0, unloading="printed", strain_scaling="raw", run=False),
+        Example(mcc.Ramp, to=1.0, rate=20.0, signed=("to",)),
+        Example(mcc.Hold, seconds=20.0),
+        Example(mcc.Programme, control="load", steps=[mcc.Ramp(1.0, 20.0)], interval_s=0.1),
+        Example(mcc.Programme.cycles, control="load", rate=2.0, unload_to=0.0, hold_s=1.0, unload_rate=1.0,
+            interval_s=0.1),
+        Example(mcc.Instrument, displacement_noise_um=0.1, force_noise_mN=0.1, displacement_resolution_um=0.1,
+            force_resolution_mN=0.1, zero_um=0.1, signed=("zero_um",)),
+        Example(simulate.read_effect, text="creep:logarithmic=0.02"),
+        Example(effects.find_variant, name="creep"),
+        Example(mcc.Curve, time_s=curve.time_s, force_mN=curve.force_mN, displacement_um=curve.displacement_um),
+        Example(mcc.Campaign, particles=["a"], diameters_um=np.full((1, 3), 100.0), curves=[curve]),
+        Example(mcc.campaign.Metadata, control="load", force_resolution_mN=0.1, punch_diameter_um=500.0),
+        Example(mcc.campaign.Segment, kind="load", start=0, stop=4),
+        Example(mcc.campaign.find_segments, curve=tests.curves[0], control="load"),
+        Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
+        Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
+        Example(calibrate.fit_shape_parameter, table=table, objective="full"),
+        Example(mcc.Model, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False),
+        Example(mcc.calibrate.LogNormalPrior, median=6.0, log_sd=0.5),
+        Example(mcc.calibrate.NormalPrior, mean=1.0, sd=1.0, signed=("mean",)),
+        Example(mcc.calibrate.NakagamiPrior, sd=0.3, shape=0.5),
+        Example(mcc.calibrate_paper, campaign=tests, threshold_MPa=0.2, objective="full", unloading="printed",
+            strain_scaling="raw", seed=0, run=False),
+        Example(mcc.least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0, run=False),
+        Example(mcc.sample, campaign=tests, threshold_MPa=0.2, mode="fast", chains=4, warmup=300, draws=1000, seed=0,
             run=False),
-        "discover": Example(mcc.discover, campaign=tests, exclude=[], threshold_MPa=0.2, confirm=True, seed=0,
-            run=False),
-        "law_for_each": Example(mcc.simulate.law_for_each,
-            plastic=mcc.simulate.paper_population().sample(jax.random.key(0), 3), a=1.4, effective_modulus_MPa=1e4,
-            unloading="printed", strain_scaling="raw", signed=("a",)),
-        "plastic_shape_factor": Example(mcc.geometry.plastic_shape_factor, particle=particle, a=1.4, signed=("a",)),
-        "spheres": Example(dem.spheres, law=the_law, diameter=np.array([1e-4, 1.2e-4]), density=1540.0),
-        "die": Example(dem.die, radius=1e-3, height=2e-3),
-        "scattered": Example(dem.scattered, key=jax.random.key(0), radius=np.array([5e-5, 6e-5]), die_radius=1e-3,
-            gap=0.02),
-        "Interaction": Example(dem.Interaction, damping=0.1, friction=0.3, wall_friction=0.2, tangential_ratio=0.8),
-        "Motion.of": Example(dem.Motion.of, time_step=1e-8, drag=0.0),
-        "stable_time_step": Example(dem.stable_time_step, packing=packing, safety=0.3),
-        "relative_density": Example(dem.relative_density, packing=packing, radius=1e-3, bottom=0.0, top=1e-3,
-            signed=("bottom", "top")),
-        "close_pairs": Example(dem.close_pairs, position=np.array([[0, 0, 0], [0, 0, 1e-4]]),
-            radius=np.array([5e-5, 6e-5]), skin=1e-5),
-        "start": Example(dem.start, packing=packing, walls=dem.die(1e-3, 2e-3),
-            position=np.array([[0, 0, 5e-4], [0, 0, 9e-4]]), skin=1e-5, capacity=16, run=False),
-        "Plane": Example(dem.Plane, point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), velocity=np.zeros(3)),
-        "Cylinder": Example(dem.Cylinder, radius=1e-3, rim=2e-3, chamfer=1e-4, velocity=np.zeros(3), signed=("rim",)),
-        "Solver": Example(dem.Solver, rtol=1e-10, max_steps=150, halvings=4, skin=0.5),
-        "fit_compaction": Example(dem.fit_compaction, packing_of=lambda _: packing, start=np.ones(2), state=None,
-            heights=heights, force=heights, run=False),
-        "golden_table": Example(export.golden_table, law=the_law, particle=particle, seed=0, units="SI", run=False),
-        "jax_artefact": Example(export.jax_artefact, law=the_law, particle=particle, which="step", dtype="float64",
-            run=False),
-        "write_export": Example(export.write_export, format="c", law=the_law, particle=particle, folder=folder, seed=0,
-            run=False),
-        "in_blocks": Example(mcc.in_blocks, function=lambda x: x, block=4),
-    }  # fmt: skip
+        Example(mcc.calibrate_many, campaigns=[tests], method="least_squares", threshold_MPa=0.2, run=False),
+        Example(mcc.discover, campaign=tests, exclude=[], threshold_MPa=0.2, confirm=True, seed=0, run=False),
+        Example(mcc.simulate.law_for_each, plastic=mcc.simulate.paper_population().sample(jax.random.key(0), 3), a=1.4,
+            effective_modulus_MPa=1e4, unloading="printed", strain_scaling="raw", signed=("a",)),
+        Example(mcc.geometry.plastic_shape_factor, particle=particle, a=1.4, signed=("a",)),
+        Example(dem.spheres, law=the_law, diameter=np.array([1e-4, 1.2e-4]), density=1540.0),
+        Example(dem.die, radius=1e-3, height=2e-3),
+        Example(dem.scattered, key=jax.random.key(0), radius=np.array([5e-5, 6e-5]), die_radius=1e-3, gap=0.02),
+        Example(dem.Interaction, damping=0.1, friction=0.3, wall_friction=0.2, tangential_ratio=0.8),
+        Example(dem.Motion.of, time_step=1e-8, drag=0.0),
+        Example(dem.stable_time_step, packing=packing, safety=0.3),
+        Example(dem.relative_density, packing=packing, radius=1e-3, bottom=0.0, top=1e-3, signed=("bottom", "top")),
+        Example(dem.close_pairs, position=np.array([[0, 0, 0], [0, 0, 1e-4]]), radius=np.array([5e-5, 6e-5]),
+            skin=1e-5),
+        Example(dem.start, packing=packing, walls=dem.die(1e-3, 2e-3), position=np.array([[0, 0, 5e-4], [0, 0, 9e-4]]),
+            skin=1e-5, capacity=16, run=False),
+        Example(dem.Plane, point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), velocity=np.zeros(3)),
+        Example(dem.Cylinder, radius=1e-3, rim=2e-3, chamfer=1e-4, velocity=np.zeros(3), signed=("rim",)),
+        Example(dem.Solver, rtol=1e-10, max_steps=150, halvings=4, skin=0.5),
+        Example(dem.fit_compaction, packing_of=lambda _: packing, start=np.ones(2), state=None, heights=heights,
+            force=heights, run=False),
+        Example(export.golden_table, law=the_law, particle=particle, seed=0, units="SI", run=False),
+        Example(export.jax_artefact, law=the_law, particle=particle, which="step", dtype="float64", run=False),
+        Example(export.write_export, format="c", law=the_law, particle=particle, folder=folder, seed=0, run=False),
+        Example(mcc.in_blocks, function=lambda x: x, block=4),
+    ]  # fmt: skip
 
 
 def same(one: Any, other: Any) -> bool:
@@ -184,7 +174,7 @@ def walk(example: Example) -> dict[str, str]:
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        json.dump({name: walk(example) for name, example in examples(Path(folder)).items()}, sys.stdout)
+        json.dump({one.call.__qualname__: walk(one) for one in examples(Path(folder))}, sys.stdout)
 
 
 if __name__ == "__main__":

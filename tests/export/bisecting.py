@@ -1,6 +1,7 @@
 """The pair of half contacts, by bisection: slow and plain, the reference of what other engines get."""
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from mcc_jax import MccLaw, Particle
 
@@ -8,37 +9,22 @@ HALVINGS = 1100  # down to the smallest floating-point number
 
 
 class _Half:
-    """One side: F = F_plates(2 d), in mN and um."""
+    """One side: F = F_plates(2 d), in mN and um; `force` and `slope` of a compression d on loading."""
 
     def __init__(self, law: MccLaw, particle: Particle) -> None:
-        self.eta = float(law.shape_factor(particle))
-        self.diameter = float(particle.effective_diameter)
-        self.area = 1e-3 * float(particle.effective_area)
-        self.K = [float(K) for K in law.plastic.polynomial]
-        self.modulus = float(law.effective_modulus)
-        self.k, self.n, self.p = law.unloading.constant, law.unloading.stress_power, law.strain_scaling.power
-
-    def stress(self, d: np.ndarray) -> np.ndarray:
-        x = 2 * self.eta * d / self.diameter
-        K1, K3, K5 = self.K
-        return np.maximum(K1 * x - K3 * x**3 + K5 * x**5, 0.0)
-
-    def force(self, d: np.ndarray) -> np.ndarray:
-        return self.area * self.stress(d)
-
-    def slope(self, d: np.ndarray) -> np.ndarray:
-        x = 2 * self.eta * d / self.diameter
-        K1, K3, K5 = self.K
-        return self.area * (K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * 2 * self.eta / self.diameter
+        self.law, self.eta, self.diameter = law, float(law.shape_factor(particle)), float(particle.effective_diameter)
+        self.area, x = 1e-3 * float(particle.effective_area), 2 * self.eta / self.diameter
+        K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
+        self.force = Polynomial(self.area * np.array([0, K1 * x, 0, -K3 * x**3, 0, K5 * x**5]))
+        self.slope = self.force.deriv()
 
     def recovered(self, d: np.ndarray) -> np.ndarray:
-        strain = np.where(d > 0, 2 * d / self.diameter, 1.0)
-        square = (self.stress(d) / self.modulus) ** self.n / (self.k * self.eta**self.p * strain)
+        k, n, p = self.law.unloading.constant, self.law.unloading.stress_power, self.law.strain_scaling.power
+        d, peak, slope = np.where(d > 0, d, 1.0), self.force(d), self.slope(d)
+        square = (peak / self.area / float(self.law.effective_modulus)) ** n / (k * self.eta**p * 2 * d / self.diameter)
         # No more than the peak itself, and no softer at the start of unloading than 32/(3 pi^2) times loading's end.
-        slope = self.slope(d)
-        steepest = 3 * np.pi / 8 * self.force(d) / np.where(slope > 0, slope, 1.0)
-        limit = np.where(slope > 0, np.minimum(d, steepest), d)
-        return np.where(d > 0, np.minimum(self.diameter * np.sqrt(square) / 2, limit), 0.0)
+        limit = np.where(slope > 0, np.minimum(d, 3 * np.pi / 8 * peak / np.where(slope > 0, slope, 1.0)), d)
+        return np.where(peak > 0, np.minimum(self.diameter * np.sqrt(square) / 2, limit), 0.0)
 
 
 def pair_force(law_i, particle_i, law_j, particle_j, overlap, overlap_max):

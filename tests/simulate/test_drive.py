@@ -10,7 +10,8 @@ from mcc_jax import MccLaw, Particle, Plastic, drive, paper_law
 from mcc_jax.simulate import RESULTS, paper_population, simulate_batch
 
 PARTICLE = Particle(213.54, 196.07, 186.33)
-BAD = [("C1", 0.0), ("C5", -2.0), ("C3", -1.0), ("C1", float("nan")), ("E", -1.0)]
+NAN = float("nan")
+BAD = [("C1", 0.0), ("C5", -2.0), ("C3", -1.0), ("C1", NAN), ("C3", NAN), ("C5", NAN), ("E", -1.0)]
 
 
 def test_displacement_and_load_control_trace_the_same_curve():
@@ -52,15 +53,6 @@ def test_a_parameter_out_of_range_is_explained(changed, why):
     C1, C3, C5, a, E = (jnp.asarray(value) for value in numbers.values())
     with pytest.raises(eqx.EquinoxRuntimeError, match=why):
         drive(MccLaw(Plastic(C1, C3, C5), a, E), Particle(200.0, 200.0, 80.0), jnp.linspace(0, 5, 5))
-
-
-def test_nan_parameters_never_pass_silently():
-    nan = jnp.asarray(jnp.nan)
-    for plastic in (Plastic(nan, 3.0, 2.6), Plastic(7.0, nan, 2.6), Plastic(7.0, 3.0, nan)):
-        law = MccLaw(plastic, 1.43, 16e3)
-        for control in ("displacement", "load"):
-            response = drive(law, PARTICLE, jnp.array([10.0, 30.0, 29.9]), control=control, throw=False)
-            assert not np.isfinite(response.force).all() or not np.isfinite(response.displacement).all()
 
 
 def test_a_law_that_is_not_monotone_is_flagged_and_snaps_through():

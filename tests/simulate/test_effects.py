@@ -17,19 +17,12 @@ def quiet(**arguments):
     return paper_campaign(4, instrument=Instrument(), programme=PROGRAMME, **arguments)
 
 
-def test_no_effect_asked_for_changes_no_bit():
-    for one, other in zip(quiet().curves, quiet(effects=()).curves, strict=True):
-        np.testing.assert_array_equal(one.displacement_um, other.displacement_um)
-    assert "effects" not in quiet().metadata.other["simulation"]
-
-
 def test_effects_reach_the_curves_with_their_time():
     plain = quiet()
     both = quiet(effects=(read_effect("frame_compliance=0.002"), read_effect("thermal_drift=0.001")))
     drift = np.array([float(v) for v in both.columns["true_thermal_drift_drift_um_per_s"]])
     assert 0.4e-3 < drift.std() < 1.6e-3
-    assert (drift < 0).any()
-    assert (drift > 0).any()
+    assert drift.min() < 0 < drift.max()
     for one, other, speed in zip(plain.curves, both.curves, drift, strict=True):
         added = 0.002 * one.force_mN + speed * one.time_s
         np.testing.assert_allclose(other.displacement_um, one.displacement_um + added, atol=1e-9)
@@ -42,13 +35,10 @@ def test_effects_reach_the_curves_with_their_time():
 
 def test_the_seed_decides_and_each_test_has_a_stream_of_its_own():
     effect = read_effect("pop_in=0.5")
-    (_, one), (_, same), (_, longer), (_, other) = (
-        effect.draw(*a) for a in ((3, 0, 5), (3, 0, 5), (3, 0, 9), (4, 0, 5))
-    )
+    one, same, longer, other = (effect.draw(*a)[1] for a in ((3, 0, 5), (3, 0, 5), (3, 0, 9), (4, 0, 5)))
     np.testing.assert_array_equal(one["location_MPa"], same["location_MPa"])
     np.testing.assert_array_equal(one["location_MPa"], longer["location_MPa"][:5])
-    assert not np.array_equal(one["location_MPa"], other["location_MPa"])
-    assert len(set(one["location_MPa"])) == 5
+    assert len({*one["location_MPa"], *other["location_MPa"]}) == 10
     assert (one["jump_um"] == 0.5).all()
     fixed = read_effect("pop_in:sharp,location_MPa=2").draw(3, 0, 5)[1]
     assert (fixed["location_MPa"] == 2).all()
@@ -57,9 +47,8 @@ def test_the_seed_decides_and_each_test_has_a_stream_of_its_own():
 @pytest.mark.extended
 def test_displacement_control_works_with_effects():
     programme = Programme.cycles(control="displacement", rate=1.0, points=40)
-    arguments = {"instrument": Instrument(), "programme": programme}
-    plain = paper_campaign(4, **arguments)
-    softer = paper_campaign(4, effects=(read_effect("frame_compliance=0.01"),), **arguments)
+    both = ((), (read_effect("frame_compliance=0.01"),))
+    plain, softer = (paper_campaign(4, instrument=Instrument(), programme=programme, effects=e) for e in both)
     for one, other in zip(plain.curves, softer.curves, strict=True):
         np.testing.assert_array_equal(one.displacement_um, other.displacement_um)
         assert other.force_mN.max() < one.force_mN.max()
