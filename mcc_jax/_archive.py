@@ -1,8 +1,8 @@
 """Typed values as bytes and back, to the last bit: dataclasses, modules, arrays, enums; never code (no pickle).
 
-A value is written as MessagePack. Arrays keep dtype, shape and bytes; an object is the name of its class, its fields
-and the cached properties that its class lists in `archived`, and is built again without running any of its code. Only
-classes of this package are built, and those of `FOREIGN`.
+Arrays keep dtype, shape and bytes; an object is the name of its class, its fields and the cached properties that its
+class lists in `archived`, and is built again without running any of its code. Only classes of this package are built,
+and those of `FOREIGN`.
 """
 
 from __future__ import annotations

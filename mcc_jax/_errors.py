@@ -13,11 +13,8 @@ class InputError(ValueError):
     The command line prints it on standard error and exits with status 2; nothing is written.
 
     Args:
-        problem: what is wrong, in words.
-        file: the file or folder concerned.
-        row: the row as a person counts it in an editor, the header being row 1.
-        column: the column's name as it is in the file.
-        remedy: what to do about it.
+        problem, remedy: what is wrong, and what to do about it.
+        file, row, column: the file or folder, the row as an editor counts it, the header being row 1, and the column.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Files from outside: regular files only, and none larger than its use can need.
 
-Each limit is several times what the largest use that we can think of needs, and small enough for the reader to end in
-time: what is larger is refused before it fills the memory.
+Each limit is several times what the largest use that we can think of needs, and small enough for the memory.
 """
 
 from __future__ import annotations

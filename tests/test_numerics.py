@@ -1,5 +1,3 @@
-import inspect
-
 import equinox as eqx
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
@@ -9,8 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from mcc_jax._numerics import horner, positive_pow, rough_power, running_max, two_thirds_power
-from mcc_jax._types import scalar
+from mcc_jax._numerics import positive_pow, running_max, two_thirds_power
 
 DTYPES = [jnp.float32, jnp.float64]
 MODES = [jax.jacfwd, jax.jacrev]
@@ -70,32 +67,6 @@ def test_running_max_of_short_paths_and_of_a_batch(dtype):
     values, tangents = jax.jvp(jax.vmap(running_max), (paths,), (jnp.arange(6, dtype=dtype).reshape(2, 3),))
     np.testing.assert_array_equal(values, [[0, 2, 2], [3, 3, 4]])
     np.testing.assert_array_equal(tangents, [[0, 1, 1], [3, 3, 5]])
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_polynomial(dtype):
-    coefficients = (2.0, -1.0, 0.5, 3.0)
-    x = jnp.linspace(-1, 1, 9, dtype=dtype)
-    assert horner(coefficients, x).dtype == dtype
-    np.testing.assert_allclose(horner(coefficients, x), np.polyval(coefficients, x), rtol=1e-6)
-    np.testing.assert_allclose(horner(coefficients, jnp.array(0.5)), np.polyval(coefficients, 0.5), rtol=1e-15)
-    np.testing.assert_array_equal(horner((4.0,), x), 4)
-
-
-def test_scalar_converter():
-    assert scalar(1).dtype == jnp.float64
-    assert scalar(jnp.float32(1)).dtype == jnp.float32
-    assert scalar(np.array(2)).dtype == jnp.float64
-    # Unwrapped: the run-time type checker of the tests would speak first.
-    with pytest.raises(ValueError, match=r"Expected a scalar, got shape \(2,\).*filter_vmap"):
-        inspect.unwrap(scalar)(jnp.zeros(2))
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("p", [-1 / 3, 0.2, 0.25, 1 / 3, 0.5])
-def test_rough_power_is_within_five_percent(dtype, p):
-    x = np.geomspace(1e-37, 1e37, 20_001).astype(dtype)
-    assert np.max(np.abs(np.asarray(rough_power(jnp.asarray(x), p)) / x.astype(float) ** p - 1)) < 0.05
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

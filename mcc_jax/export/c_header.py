@@ -23,13 +23,14 @@ from ..law.response import factor_at_peak, folded
 from .origin import UNKNOWN, Origin, check, effects_of, numbers
 
 
-def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKNOWN) -> str:
+def c_header(law: MccLaw, particle: Particle, *, origin: Origin = UNKNOWN) -> str:
     """A C99 header, valid as C++, in SI units, with the law's numbers as an initialiser.
 
     It holds force, tangent and history of one particle between platens, and of a pair of half contacts, for all forms
     of unloading and strain scaling. Coefficients are passed as a struct, so that every particle can have its own.
     Effects that are closed formulas are part of it (`AbstractEffect.closed`), with their numbers as constants. The
-    comment on top states the `origin` of the law and the size of a `particle`. A law that is not monotone is accepted.
+    comment on top states the `origin` of the law and the size of the golden table's `particle`. A law that is not
+    monotone is accepted.
 
     Raises:
         InputError: if a parameter is out of its range, the particle carries no stress, or an effect is no closed
@@ -48,7 +49,7 @@ def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin = UNKNOWN) ->
     return _rendered("yade.md.j2", law, particle, origin)
 
 
-def _rendered(template: str, law: MccLaw, particle: Particle | None, origin: Origin) -> str:
+def _rendered(template: str, law: MccLaw, particle: Particle, origin: Origin) -> str:
     """A template with the law's values put in, in SI units; a value it wants and does not get is an error."""
     with extra("export"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -75,7 +76,7 @@ def _rendered(template: str, law: MccLaw, particle: Particle | None, origin: Ori
     )
 
 
-def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
+def _origin_lines(law: MccLaw, particle: Particle, origin: Origin) -> list[str]:
     lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
     for one in effects_of(law):
         values = ", ".join(f"{name} = {value:.6g}" for name, value in one["numbers"].items())
@@ -86,9 +87,8 @@ def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> lis
             lines.append("WARNING: that calibration did not converge.")
     whose = "the population (medians)" if origin.particle is None else f"particle {_quoted(origin.particle)}"
     lines.append(f"Coefficients of {whose}.")
-    if particle is not None:
-        sizes = ", ".join(f"{float(d):.6g}" for d in jax.tree.leaves(particle))
-        lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)}).")
+    sizes = ", ".join(f"{float(d):.6g}" for d in jax.tree.leaves(particle))
+    lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)}).")
     if not bool(law.is_monotone):
         lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
     return lines
@@ -114,9 +114,9 @@ def parameters_in_c(law: MccLaw) -> str | None:
     return "\n".join([*lines, *(f"own.{name} = {value};" for name, value in zip(names, results, strict=True))])
 
 
-def factor_in_c(law: MccLaw, particle: Particle | None) -> str | None:
+def factor_in_c(law: MccLaw, particle: Particle) -> str | None:
     """C statements that return the factor on the modulus at `strain` and `stress` [MPa]; None if there is none."""
-    at_peak = half_contact(law, Particle(200.0, 200.0, 200.0) if particle is None else particle).effects
+    at_peak = half_contact(law, particle).effects
     if not at_peak:
         return None
     lines, results = in_c(lambda strain, stress: (factor_at_peak(at_peak, strain, stress),), ["strain", "stress"])

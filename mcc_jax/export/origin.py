@@ -80,14 +80,14 @@ def effects_of(law: MccLaw) -> list[dict[str, Any]]:
     return effects
 
 
-def check(law: MccLaw, particle: Particle | None, *, monotone: bool = False) -> None:
+def check(law: MccLaw, particle: Particle, *, monotone: bool = False) -> None:
     """Raise `InputError` for a law or a particle that cannot be exported."""
-    if law.plastic.C1.ndim or law.a.ndim or (particle is not None and particle.D3.ndim):
+    if law.plastic.C1.ndim or law.a.ndim or particle.D3.ndim:
         raise InputError("a batch of laws or particles cannot be exported", remedy="Export one law.")
     if not bool(law.is_valid) or not all(abs(number) < HUGE for number in numbers(law).values()):
         remedy = f"C1, C5 and the modulus must be positive, and all below {HUGE:g}"
         raise InputError(f"the law is not usable: {numbers(law)}", remedy=remedy)
-    if particle is not None and not bool(law.carries_stress(particle)):
+    if not bool(law.carries_stress(particle)):
         sizes, eta = ", ".join(f"{float(d):g}" for d in jax.tree.leaves(particle)), float(law.shape_factor(particle))
         raise InputError(
             f"the shape factor of a particle of {sizes} um is {eta:.4g} with a = {float(law.a):.4g}",

@@ -68,11 +68,11 @@ class CurveTables:
     __repr__ = described()
 
 
-def curve_tables(law: MccLaw, particle: Particle | None = None) -> CurveTables:
+def curve_tables(law: MccLaw, particle: Particle) -> CurveTables:
     """Tables of the master curves of a law, right to 1e-5, up to the largest scaled strain of the paper's tests.
 
-    Without effects they hold for all particles, whose size and shape come in through the scaled strain; with effects
-    for `particle` alone.
+    With effects they hold for `particle` alone; without effects for all, whose size and shape come in through the
+    scaled strain.
 
     Raises:
         InputError: if 65536 points do not suffice, or naming an effect that is no closed formula.
@@ -80,12 +80,8 @@ def curve_tables(law: MccLaw, particle: Particle | None = None) -> CurveTables:
     import pandas as pd
 
     check(law, particle)
-    formulas, side = law, None
-    if law.effects:
-        if particle is None:
-            raise InputError("particle must be given", remedy="Make one with mcc_jax.Particle(D1, D2, D3), in um.")
-        side = half_contact(law, particle)
-        formulas, _ = folded(law, law.effects, particle, "the tables")
+    formulas, _ = folded(law, law.effects, particle, "the tables")
+    side = half_contact(law, particle) if law.effects else None
     n, k = law.unloading.stress_power, law.unloading.constant
     plain = Contact(*formulas.plastic.polynomial, 1 / (k * formulas.effective_modulus**n), power=n)
 

@@ -42,12 +42,12 @@ FORMULAE = {
 }
 
 
-def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKNOWN) -> dict[str, Any]:
+def card(law: MccLaw, particle: Particle, *, origin: Origin = UNKNOWN) -> dict[str, Any]:
     """The parameter card of a law, ready for `json.dump`.
 
     It has parameters with unit and uncertainty, form of the law, its effects with equation and numbers, validity,
-    formulae in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; of a particle its
-    size and shape factor. Uncertainty and provenance are those of `origin`.
+    formulae in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; of the golden table's
+    particle size and shape factor. Uncertainty and provenance are those of `origin`.
 
     References:
         Bommireddy et al. (2018), eqs. 13, 16, 23, 24.
@@ -64,17 +64,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
         known = origin.estimates.get(name, {})
         parameters[name] = {"sd": None, "interval_95": None, **known, "value": value, "unit": unit}
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
-    shown = None
-    if particle is not None:
-        diameter, eta = particle.effective_diameter, law.shape_factor(particle)
-        shown = {
-            **{f"{name}_um": float(getattr(particle, name)) for name in ("D1", "D2", "D3")},
-            "effective_diameter_um": float(diameter),
-            "effective_area_um2": float(particle.effective_area),
-            "eta_p": float(eta),
-            "displacement_valid_um": TESTED_STRAIN * float(diameter / eta),
-            "from": origin.geometry,
-        }
+    diameter, eta = particle.effective_diameter, law.shape_factor(particle)
     return {
         "schema": 1,
         "what": "loading-unloading contact law of microcrystalline cellulose particles",
@@ -86,7 +76,14 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin = UNKN
         "polynomial_MPa": {"K1": K1, "K3": K3, "K5": K5, "formula": "sigma = K1 x - K3 x^3 + K5 x^5"},
         "population": origin.population,
         "is_monotone": bool(law.is_monotone),
-        "particle": shown,
+        "particle": {
+            **{f"{name}_um": float(getattr(particle, name)) for name in ("D1", "D2", "D3")},
+            "effective_diameter_um": float(diameter),
+            "effective_area_um2": float(particle.effective_area),
+            "eta_p": float(eta),
+            "displacement_valid_um": TESTED_STRAIN * float(diameter / eta),
+            "from": origin.geometry,
+        },
         "validity": {
             "scaled_strain_max": TESTED_STRAIN,
             "stress_there_MPa": TESTED_STRAIN * (K1 - TESTED_STRAIN**2 * (K3 - TESTED_STRAIN**2 * K5)),
@@ -140,15 +137,16 @@ def write_export(
 
 def _files(format: str, law: MccLaw, particle: Particle, origin: Origin, seed: int) -> dict[str, Any]:
     """What each file holds: text, bytes, a table, or what JSON can."""
+    files: dict[str, Any] = {}
     if format in ("c", "lammps", "yade"):
-        recipes = {"lammps": lammps_recipe, "yade": yade_recipe}
-        return {
-            **({f"{format}.md": recipes[format](law, particle, origin=origin)} if format in recipes else {}),
-            "mcc_law.h": c_header(law, particle, origin=origin),
-            "mcc_law_golden.csv": golden_table(law, particle, seed=seed, units="SI"),
-            "mcc_law_pair_golden.csv": golden_pair_table(law, particle, seed=seed, units="SI"),
-        }
-    name, files, more = "parameters", {}, {}
+        if format != "c":
+            recipe = lammps_recipe if format == "lammps" else yade_recipe
+            files[f"{format}.md"] = recipe(law, particle, origin=origin)
+        files["mcc_law.h"] = c_header(law, particle, origin=origin)
+        files["mcc_law_golden.csv"] = golden_table(law, particle, seed=seed, units="SI")
+        files["mcc_law_pair_golden.csv"] = golden_pair_table(law, particle, seed=seed, units="SI")
+        return files
+    name, more = "parameters", {}
     if format == "csv":
         name, tables = "master_curve", curve_tables(law, particle)
         files = {"master_curve.csv": tables.loading, "unloading_curve.csv": tables.unloading}

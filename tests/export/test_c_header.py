@@ -34,7 +34,7 @@ KINDS = pytest.mark.parametrize("kind", PATHS, ids=["plates", "wall", "pair"])
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
-    return build_driver(tmp_path_factory.mktemp("header"), c_header(paper_law()))
+    return build_driver(tmp_path_factory.mktemp("header"), c_header(paper_law(), PARTICLE))
 
 
 @KINDS
@@ -139,7 +139,7 @@ int main(void)
 
 
 def test_along_any_normal_is_the_plate_along_D3_and_the_sphere_everywhere(tmp_path):
-    out = compile_and_run(tmp_path, c_header(paper_law()), NORMALS)
+    out = compile_and_run(tmp_path, c_header(paper_law(), PARTICLE), NORMALS)
     rows = np.array([[float(v) for v in line.split()] for line in out.splitlines()])
     np.testing.assert_allclose(rows[1::2], rows[::2], rtol=1e-13)
     assert len({row[0] for row in rows}) > 2

@@ -36,7 +36,7 @@ def run_recipe(folder, recipe, header, host):
 @pytest.mark.parametrize("form", FORMS, ids=str)
 def test_the_normal_model_for_lammps_gives_the_headers_forces(tmp_path, form):
     law = paper_law(*form)
-    numbers = run_recipe(tmp_path, lammps_recipe(law, PARTICLE), c_header(law), "lammps")
+    numbers = run_recipe(tmp_path, lammps_recipe(law, PARTICLE), c_header(law, PARTICLE), "lammps")
     force, want, history, x_max, without_update = numbers.T
     assert len(force) == 14
     assert (want > 0).sum() >= 6
@@ -49,7 +49,7 @@ def test_the_normal_model_for_lammps_gives_the_headers_forces(tmp_path, form):
 @pytest.mark.parametrize("form", FORMS, ids=str)
 def test_the_functors_for_yade_give_the_headers_forces(tmp_path, form):
     law = paper_law(*form)
-    numbers = run_recipe(tmp_path, yade_recipe(law, PARTICLE), c_header(law), "yade")
+    numbers = run_recipe(tmp_path, yade_recipe(law, PARTICLE), c_header(law, PARTICLE), "yade")
     force, want, shear, friction = numbers.T
     assert len(force) == 21
     np.testing.assert_array_equal(force, want)

@@ -22,7 +22,7 @@ numbers = st.tuples(
 def test_linear_interpolation_is_within_the_stated_error(drawn):
     C1, share, C5, modulus, form = drawn
     law = MccLaw(Plastic(C1, share * (20 / 9 * C1 * C5**5) ** (1 / 6), C5), 1.43, modulus, *form)
-    tables = curve_tables(law)
+    tables = curve_tables(law, PARTICLE)
     assert tables.error <= TOLERANCE
     x = np.random.default_rng(0).uniform(0, 0.67, 4000)
     at = tables.loading.set_index("scaled_strain")
@@ -53,13 +53,13 @@ def test_recovered_strain_of_any_shape(form, modulus, D3):
     law, particle = MccLaw(paper_law().plastic, 1.43, modulus, *form), Particle(213.54, 196.07, D3)
     eta = float(law.shape_factor(particle))
     peak = 0.67 / eta * np.random.default_rng(1).uniform(0, 1, 4000) ** 4
-    delta = interpolated(curve_tables(law).loading, law, eta, eta * peak)[1] / eta
+    delta = interpolated(curve_tables(law, PARTICLE).loading, law, eta, eta * peak)[1] / eta
     want = np.asarray(law.recoverable_strain(particle, jnp.asarray(peak)))
     assert np.abs(delta - want).max() <= 3e-5 * want.max()
 
 
 def test_the_unloading_curve_is_the_arcsine_law():
-    table = curve_tables(paper_law()).unloading
+    table = curve_tables(paper_law(), PARTICLE).unloading
     s = np.random.default_rng(1).uniform(0, 1, 5000)
     want = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
     assert np.abs(np.interp(s, table["recovered_share"], table["stress_share"]) - want).max() <= TOLERANCE
@@ -82,12 +82,12 @@ def assert_rebuilt(law, particle, tables):
 @pytest.mark.parametrize("form", [FORMS[0], FORMS[4], FORMS[8]], ids=str)
 def test_the_law_rebuilt_from_the_tables_alone(form):
     law = paper_law(*form)
-    assert_rebuilt(law, Particle(213.54, 196.07, 150.0), curve_tables(law))
+    assert_rebuilt(law, Particle(213.54, 196.07, 150.0), curve_tables(law, PARTICLE))
 
 
 def test_a_curve_with_a_corner_is_refused():
     with pytest.raises(InputError, match="corner"):
-        curve_tables(MccLaw(Plastic(1.0, 4.0, 2.0), 1.43, 16000.0))
+        curve_tables(MccLaw(Plastic(1.0, 4.0, 2.0), 1.43, 16000.0), PARTICLE)
 
 
 def test_golden_table_is_the_law_driven_along_its_paths():

@@ -90,10 +90,11 @@ def _write(folder):
     return write_calibration(posterior, Stage(folder, folder), origin={}, figures=False, progress=print)
 
 
+SPHERE = mcc.Particle(200.0, 200.0, 200.0)
 CALLS = {
     "bokeh": ("report", _report),
-    "jinja2": ("export", lambda _: mcc.export.c_header(mcc.paper_law())),
-    "flatbuffers": ("export", lambda _: mcc.export.jax_artefact(mcc.paper_law(), mcc.Particle(200.0, 190.0, 180.0))),
+    "jinja2": ("export", lambda _: mcc.export.c_header(mcc.paper_law(), SPHERE)),
+    "flatbuffers": ("export", lambda _: mcc.export.jax_artefact(mcc.paper_law(), SPHERE)),
     "h5netcdf": ("netcdf", _write),
 }
 
