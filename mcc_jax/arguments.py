@@ -187,9 +187,10 @@ def diameters(value: Any) -> np.ndarray:
 def one_particle(value: Any) -> np.ndarray:
     """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite."""
     array = floats(value, "diameters_um", shape="D1, D2, D3 [um] of one particle")
-    if array.shape != (3,):
-        raise InputError(f"diameters_um must be D1, D2, D3 [um] of one particle, got {shown(array.tolist())}")
-    return diameters(array[None])[0]
+    if array.shape == (3,) and (np.isfinite(array) & (array > 0)).all():
+        return array
+    must = "diameters_um must be the three positive diameters D1, D2, D3 [um] of a particle"
+    raise InputError(f"{must}, got {shown(array.tolist())}")
 
 
 def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) -> None:

@@ -102,7 +102,8 @@ class HiddenEffect:
             else:
                 values[name] = low + (high - low) * share
         arrays = {name: jnp.asarray(value, dtype=float) for name, value in values.items()}
-        return eqx.filter_vmap(self.variant.build)(arrays.pop(self.variant.parameter), **arrays), values
+        build = eqx.filter_vmap(lambda amplitude, others: self.variant.build(amplitude, **others))
+        return build(arrays.pop(self.variant.parameter), arrays), values
 
     @property
     def random(self) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from compiling import (
     compile_and_run,
     compile_with,
     head,
+    law_numbers,
     random_laws,
     random_paths,
     recovered_from,
@@ -25,7 +26,7 @@ from compiling import (
 )
 from helpers import FORMS
 
-from mcc_jax import InputError, MccLaw, Particle, Plastic, Unloading, paper_law
+from mcc_jax import InputError, MccLaw, Particle, Plastic, paper_law
 from mcc_jax.export import Origin, c_header
 
 PATHS = {PLATES: 100_000, WALL: 100_000, PAIR: 3000}
@@ -105,11 +106,8 @@ def test_compiles_without_a_warning_and_holds_the_values(tmp_path, language):
     """Every form, twice included, and the initialiser gives back the law to the last bit."""
     for number, form in enumerate(FORMS):
         law = paper_law(*form)
-        values = {name: float(getattr(law.plastic, name)) for name in ("C1", "C3", "C5")}
-        values |= {"a": float(law.a), "effective_modulus": float(1e6 * law.effective_modulus)}
-        values |= {"k": law.unloading.constant, "n": 1.0 if law.unloading is Unloading.PRINTED else 2.0}
-        values |= {"p": float(law.strain_scaling.power)}
-        tests = " || ".join(f'l.{name} != strtod("{value.hex()}", NULL)' for name, value in values.items())
+        values = zip(("C1", "C3", "C5", "a", "effective_modulus", "k", "n", "p"), law_numbers(law), strict=True)
+        tests = " || ".join(f'l.{name} != strtod("{float(value).hex()}", NULL)' for name, value in values)
         (tmp_path / f"law_{number}.h").write_text(c_header(law, PARTICLE))
         source, program = tmp_path / f"main_{number}.c", tmp_path / f"main_{number}"
         source.write_text(
