@@ -1,6 +1,5 @@
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 from compiling import PARTICLE
 from helpers import FORMS
@@ -122,5 +121,6 @@ def test_seed_and_units():
 def test_every_digit_survives_the_file(tmp_path):
     write_export("json", paper_law(), PARTICLE, tmp_path)
     table = golden_table(paper_law(), PARTICLE)
-    read = pd.read_csv(tmp_path / "parameters_golden.csv", float_precision="round_trip")
-    pd.testing.assert_frame_equal(read, table, check_exact=True)
+    file = tmp_path / "parameters_golden.csv"
+    assert file.read_text().startswith(",".join(table.columns) + "\n")
+    np.testing.assert_array_equal(np.loadtxt(file, delimiter=",", skiprows=1), table.to_numpy(float))
