@@ -11,6 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from mcc_jax import InputError
 from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM, PAPER_LOG_C
 from mcc_jax.geometry import Particle
 from mcc_jax.law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
@@ -56,6 +57,14 @@ def close(actual, expected, *, rel=0.0, scale=0.0):
     off = np.abs(actual - expected) - rel * np.abs(expected) - scale
     worst = np.unravel_index(np.nanargmax(off), off.shape) if off.size else ()
     assert np.all(off <= 0), f"at {worst}: {actual[worst]!r} is not {expected[worst]!r}"
+
+
+def refusal(read, *args, **kwargs):
+    """The one line with which a call refuses its input."""
+    with pytest.raises(InputError) as caught:
+        read(*args, **kwargs)
+    assert str(caught.value).isprintable()
+    return str(caught.value)
 
 
 def all_finite(tree):

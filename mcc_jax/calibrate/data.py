@@ -165,9 +165,9 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
         for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
-    ends = [(None, None) if isinstance(one, Finding) else (one.stress_max_MPa, one.strain_range) for one in prepared]
-    stress, strain = zip(*ends, strict=True)
-    prepared = [apart or one for one, apart in zip(prepared, far_apart(stress, strain), strict=True)]
+    usable = {i: one for i, one in enumerate(prepared) if not isinstance(one, Finding)}
+    apart = far_apart({i: (one.stress_max_MPa, one.strain_range) for i, one in usable.items()})
+    prepared = [apart.get(i, one) for i, one in enumerate(prepared)]
     reasons = tuple(one if isinstance(one, Finding) else None for one in prepared)
     used = {i: one for i, one in enumerate(prepared) if not isinstance(one, Finding)}
     if not used:

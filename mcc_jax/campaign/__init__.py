@@ -10,7 +10,6 @@ from .adjustment import campaign_segments as campaign_segments
 from .adjustment import effective_diameter_um as effective_diameter_um
 from .adjustment import loading_curve as loading_curve
 from .adjustment import stress_and_strain as stress_and_strain
-from .csv import check_folder as check_folder
 from .csv import file_checksums as file_checksums
 from .csv import read_campaign as read_campaign
 from .csv import read_particles as read_particles
@@ -30,17 +29,15 @@ from .readers import read_diameters as read_diameters
 from .readers import read_instrument_file as read_instrument_file
 from .record import available_data as available_data
 from .record import humidities as humidities
-from .record import record_batch as record_batch
 from .record import record_of as record_of
 from .schema import Campaign as Campaign
 from .schema import Control as Control
 from .schema import Curve as Curve
 from .schema import Metadata as Metadata
+from .schema import check_campaign as check_campaign
+from .schema import join_campaigns as join_campaigns
 from .segments import Segment as Segment
 from .segments import SegmentKind as SegmentKind
 from .segments import find_segments as find_segments
-from .segments import summarise_segments as summarise_segments
 from .turning import TurningForces as TurningForces
 from .turning import turning_forces as turning_forces
-from .validate import check_campaign as check_campaign
-from .validate import join_campaigns as join_campaigns

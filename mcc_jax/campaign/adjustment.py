@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +13,9 @@ from .._errors import InputError
 from .._format import described
 from .findings import Finding
 from .plausibility import add_likely_unit_error
-from .schema import Campaign, Curve
+from .schema import Campaign, Curve, check_campaign
 from .segments import Segment, contact_index, find_segments
 from .signal import median
-from .validate import check_campaign
 
 THRESHOLD_MPA = 0.2
 """Stress below which surface irregularities, not the particle, deform [MPa] (Bommireddy et al. 2018, section 3)."""
@@ -32,15 +31,10 @@ SHOWN = 3  # particles that an error names with their reasons, at most
 
 @dataclass(frozen=True)
 class LoadingCurve:
-    r"""Strain at which virgin loading first reached a stress, :math:`\epsilon_i(\sigma)`.
+    r"""Strain at which virgin loading first reached a stress, :math:`\epsilon_i(\sigma)`; shape (n,), n >= 2."""
 
-    Attributes:
-        stress_MPa: increasing stresses [MPa], shape (n,), n >= 2.
-        strain: the strains there [-], from the test's zero of displacement.
-    """
-
-    stress_MPa: np.ndarray
-    strain: np.ndarray
+    stress_MPa: np.ndarray  # increasing
+    strain: np.ndarray  # from the test's zero of displacement
 
     __repr__ = described()
 
@@ -69,16 +63,13 @@ def campaign_segments(campaign: Campaign) -> tuple[tuple[Segment, ...], ...]:
 def stress_and_strain(
     curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Effective stress [MPa] and strain [-] of every point of a test.
+    r"""Effective stress [MPa] and strain [-] of every point of a test (Bommireddy et al. 2018, eqs. 3 and 4).
 
     .. math:: \sigma = F / (\pi R_e^2), \qquad \epsilon = (\gamma - \gamma_0) / D_e
 
     Strain counts from :math:`\gamma_0`, the platen's position at first contact: where the approach ends if the record
     has one, the test machine's own zero otherwise, or the first reading if that zero is far from the test
     (`MACHINE_ZERO`).
-
-    References:
-        Bommireddy et al. (2018), eqs. 3 and 4.
     """
     diameter, path = effective_diameter_um(diameters_um), curve.displacement_um
     first, reach = float(path[0]), float(np.ptp(path))
@@ -91,8 +82,8 @@ def stress_and_strain(
 def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]) -> LoadingCurve | None:
     """The virgin loading of a test, over all its cycles, as strain over stress; None if the test never loads.
 
-    Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise; points that
-    share one force are averaged. Readings that may not be compared with a law do not count.
+    Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise. Readings
+    that may not be compared with a law do not count.
     """
     from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
 
@@ -116,23 +107,14 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segmen
 
 @dataclass(frozen=True)
 class Adjustment:
-    """The paper's offset step for a whole campaign.
+    """The paper's offset step for a whole campaign."""
 
-    Attributes:
-        curves: adjusted loading curve of every particle that is kept, None for the others.
-        shift: what was added to each particle's strain [-], shape (N,); 0 where not kept.
-        threshold_MPa: the stress at which all adjusted curves meet; 0 if no offset step was made.
-        strain: their common strain there, the mean over the particles.
-        reasons: for each particle, None if kept, else why it is not.
-        segments: the segments of every test, for whoever needs them next.
-    """
-
-    curves: tuple[LoadingCurve | None, ...]
-    shift: np.ndarray
-    threshold_MPa: float
-    strain: float
-    reasons: tuple[Finding | None, ...]
-    segments: tuple[tuple[Segment, ...], ...]
+    curves: tuple[LoadingCurve | None, ...]  # adjusted, of every particle that is kept
+    shift: np.ndarray  # what was added to each particle's strain [-], shape (N,); 0 where not kept
+    threshold_MPa: float  # at which all adjusted curves meet; 0 if no offset step was made
+    strain: float  # their common strain there, the mean over the particles
+    reasons: tuple[Finding | None, ...]  # why a particle is not kept
+    segments: tuple[tuple[Segment, ...], ...]  # of every test
 
     __repr__ = described()
 
@@ -154,42 +136,30 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
         \bar\epsilon_t = \tfrac1N \sum_j \epsilon_j(\sigma_t)
 
     The step also removes true differences in shape below the threshold, which biases `a`; see `calibrate`'s
-    documentation for how much. `threshold_MPa = 0` leaves every curve as measured.
-
-    References:
-        Bommireddy et al. (2018), section 3.
+    documentation for how much. `threshold_MPa = 0` leaves every curve as measured (Bommireddy et al. 2018, section 3).
     """
     segments = campaign_segments(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     tests = list(zip(campaign.curves, campaign.diameters_um, segments, strict=True))
     curves = [loading_curve(*test) for test in tests]
     reasons = [_why_not(curve, *test, threshold_MPa) for curve, test in zip(curves, tests, strict=True)]
-    curves = [None if reason else curve for curve, reason in zip(curves, reasons, strict=True)]
-    stress = [None if curve is None else curve.stress_max_MPa for curve in curves]
-    strain = [None if curve is None else float(np.ptp(curve.strain[1:])) for curve in curves]
-    reasons = tuple(one or apart for one, apart in zip(reasons, far_apart(stress, strain), strict=True))
-    curves = tuple(None if reason else curve for curve, reason in zip(curves, reasons, strict=True))
-    known = {i: float(curve.at(threshold_MPa)) for i, curve in enumerate(curves) if curve is not None}
-    shift = np.zeros(len(curves))
-    if threshold_MPa == 0 or not known:
-        return Adjustment(curves, shift, threshold_MPa, 0.0, reasons, segments)
-    mean = float(np.mean(list(known.values())))
-    for i, strain in known.items():
-        shift[i] = mean - strain
-    adjusted = tuple(
-        None if curve is None else _through(curve, offset, threshold_MPa, mean)
-        for curve, offset in zip(curves, shift, strict=True)
-    )
-    return Adjustment(adjusted, shift, threshold_MPa, mean, reasons, segments)
-
-
-def _through(curve: LoadingCurve, offset: float, threshold_MPa: float, strain: float) -> LoadingCurve:
-    """The curve moved by a strain, and straight from the origin to a strain at the threshold."""
-    above = curve.stress_MPa > threshold_MPa
-    return LoadingCurve(
-        np.concatenate([[0.0, threshold_MPa], curve.stress_MPa[above]]),
-        np.concatenate([[0.0, strain], curve.strain[above] + offset]),
-    )
+    used = {i: c for i, (c, reason) in enumerate(zip(curves, reasons, strict=True)) if c is not None and not reason}
+    apart = far_apart({i: (curve.stress_max_MPa, float(np.ptp(curve.strain[1:]))) for i, curve in used.items()})
+    reasons = tuple(apart.get(i, reason) for i, reason in enumerate(reasons))
+    used = {i: curve for i, curve in used.items() if i not in apart}
+    shift, mean = np.zeros(len(tests)), 0.0
+    if threshold_MPa > 0 and used:
+        strain = {i: float(curve.at(threshold_MPa)) for i, curve in used.items()}
+        mean = float(np.mean(list(strain.values())))
+        for i, curve in used.items():
+            shift[i] = mean - strain[i]
+            above = curve.stress_MPa > threshold_MPa
+            used[i] = LoadingCurve(
+                np.concatenate([[0.0, threshold_MPa], curve.stress_MPa[above]]),
+                np.concatenate([[0.0, mean], curve.strain[above] + shift[i]]),
+            )
+    curves = tuple(used.get(i) for i in range(len(tests)))
+    return Adjustment(curves, shift, threshold_MPa, mean, reasons, segments)
 
 
 def _why_not(
@@ -217,7 +187,7 @@ def _reason(sentence: str, remedy: str) -> Finding:
 
 
 def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarray, threshold_MPa: float) -> Finding:
-    """Why a test with these stresses [MPa], shape (n,), has no virgin loading; below the threshold nothing counts."""
+    """Why a test with these stresses [MPa] has no virgin loading; below the threshold nothing counts."""
     force = curve.force_mN
     low, high = float(force.min()), float(force.max())
     column = "check that the right column is taken as force, or"
@@ -266,29 +236,27 @@ def too_few(points: int, least: int) -> Finding:
     return _reason(what, "record loading with more readings, or lower the threshold")
 
 
-def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]) -> list[Finding | None]:
-    """Which tests are in other units than the rest, by the largest stress of each particle and its range of
-    displacement over its effective diameter; None for those that are not used anyway."""
-    found: list[Finding | None] = [None] * len(stress_MPa)
-    weak = "reaches {:.3g} MPa where the others reach {:.3g} MPa"
-    short = "is compressed by {:.3g} of its size where the others are by {:.3g}"
-    for values, what, unit in (
-        (stress_MPa, weak, "force and its diameters (they turn force into stress)"),
-        (strain, short, "displacement and its diameters"),
-    ):
-        ordered = np.sort([value for value in values if value is not None])
-        for i, own in enumerate(values):
-            if own is None or len(ordered) < 2 or found[i] is not None:
-                continue
-            usual = median(np.delete(ordered, np.searchsorted(ordered, own)))
-            if not usual / FAR_APART <= own <= usual * FAR_APART:
-                found[i] = _reason(what.format(own, usual), f"check its unit of {unit}, or leave the particle out")
+_APART = (
+    ("reaches {:.3g} MPa where the others reach {:.3g} MPa", "force and its diameters (they turn force into stress)"),
+    ("is compressed by {:.3g} of its size where the others are by {:.3g}", "displacement and its diameters"),
+)
+
+
+def far_apart(ends: Mapping[int, tuple[float, float]]) -> dict[int, Finding]:
+    """Which tests are in other units than the rest, by the largest stress [MPa] of each and its range of displacement
+    over its effective diameter."""
+    found: dict[int, Finding] = {}
+    for k, (what, unit) in enumerate(_APART):
+        ordered = np.sort([end[k] for end in ends.values()])
+        for i, end in ends.items() if len(ends) > 1 else ():
+            usual = median(np.delete(ordered, np.searchsorted(ordered, end[k])))
+            if i not in found and not usual / FAR_APART <= end[k] <= usual * FAR_APART:
+                found[i] = _reason(what.format(end[k], usual), f"check its unit of {unit}, or leave the particle out")
     return found
 
 
 def refusal(campaign: Campaign, problem: str, reasons: Sequence[Finding | None]) -> InputError:
-    """The error that says why particles cannot be used, with every reason once, and what to do; reasons are None for
-    particles that can be used."""
+    """The error that says why particles cannot be used, with every reason once, and what to do."""
     groups: dict[Finding, list[str]] = {}
     for name, reason in zip(campaign.particles, reasons, strict=True):
         if reason is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from .._format import described, first_few
 
@@ -16,12 +16,10 @@ class Finding:
     """One thing that a reader of the numbers must know.
 
     Attributes:
-        check: what was checked, in two or three words: "zero of force", "saturation", "breakage", "plausibility",
-            "fitted modulus".
+        check: what was checked, in two or three words: "zero of force", "breakage", "plausibility".
         level: "info" where it was settled (corrected, or readings left out), "warning" where the numbers are to be used
             with care, "error" where they are not to be trusted before it is settled.
-        sentence: what was found and what was done about it, without its full stop. Of a single test it has `{}` in
-            place of its numbers.
+        sentence: what was found and done, without its full stop; of a single test with `{}` in place of its numbers.
         remedy: what a person can do, without its full stop; empty where nothing need be done.
         particles: names of the particles concerned; empty where it concerns the whole campaign.
         code: what was found, for programs that decide by it; not in files.
@@ -63,9 +61,7 @@ class Finding:
 
 def worst(findings: Iterable[Finding]) -> Level | None:
     """The most serious level among findings, None where there are none."""
-    levels = {one.level for one in findings}
-    order: tuple[Level, ...] = ("error", "warning", "info")
-    return next((level for level in order if level in levels), None)
+    return max((one.level for one in findings), key=get_args(Level).index, default=None)
 
 
 def named(names: tuple[str, ...], of: int, most: int = 5) -> str:

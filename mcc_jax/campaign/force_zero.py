@@ -56,11 +56,10 @@ OPEN = Finding(
 
 
 class ZeroOfForce(NamedTuple):
-    """What to take off at each reading, one number or shape (n,); the zero at contact and its standard deviation [mN];
-    and what was found."""
+    """The zero of force of a test [mN]."""
 
-    path: np.ndarray | float
-    value: float
+    path: np.ndarray | float  # what to take off: at each reading, shape (n,), or the same at all
+    value: float  # at contact
     sd: float
     finding: Finding | None
 
@@ -70,9 +69,8 @@ def zero_of_force(
 ) -> ZeroOfForce | None:
     """The force that is read before contact; None if nothing shows another zero than the file's own.
 
-    Without a drift it is the readings' mean, with the error of a mean of autocorrelated readings. With a drift it is
-    their line over time up to contact, and its value there from then on; what the drift did during the test nobody
-    knows, so its change before contact is the error. Without readings before contact, see `_begins_elsewhere`.
+    Without a drift it is the readings' mean. With a drift it is their line over time up to contact, and its value there
+    from then on; the drift during the test is unknown, so its change before contact is the error.
     """
     contact, change = _air_until(curve, control)
     least = AIR_SHARE * float(np.ptp(curve.force_mN))
@@ -133,22 +131,18 @@ def _first_steps(curve: Curve) -> float:
 
 
 def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None, least: float) -> ZeroOfForce | None:
-    """A record in contact whose first reading is below zero, or more than a step of the ramp above it.
-
-    Below zero the load cell was not tared: the reading is taken off, and its error is as large as itself, unless all
-    tests share a zero, which is known better. Above it, that and a preload look alike, and the file's zero stays. One
-    that begins above `START_SHARE` of its largest force has lost its loading, and shows no zero at all.
-    """
+    """A record in contact whose first reading is below zero, or more than a step of the ramp above it."""
     first = float(curve.force_mN[0])
     if zero_mN is not None:
         zero, error = zero_mN
         return ZeroOfForce(zero, zero, error, NOT_TARED.of(first, zero) if zero < 0 else None)
     least = max(least, AIR_SAID * point_noise(curve.force_mN))
+    # A record that begins far from zero has lost its loading, and shows no zero at all.
     if -least <= first <= _first_steps(curve) + least or abs(first) > START_SHARE * float(curve.force_mN.max()):
         return None
-    if first < 0:
+    if first < 0:  # not tared: the error is as large as the reading itself, unless all tests share a zero
         return ZeroOfForce(first, first, -first, NOT_TARED.of(first, first))
-    return ZeroOfForce(0.0, 0.0, 0.0, OPEN.of(first))
+    return ZeroOfForce(0.0, 0.0, 0.0, OPEN.of(first))  # not tared or a preload: the file's own zero stays
 
 
 def _inflation(scatter: np.ndarray) -> float:
@@ -158,11 +152,8 @@ def _inflation(scatter: np.ndarray) -> float:
 
 
 def _air_until(curve: Curve, control: Control | None) -> tuple[int | None, float]:
-    """How many readings were taken before contact. If too few, None, and the change of force [mN] in a slower straight
-    course before loading, which may be a drift.
-
-    Where `find_segments` finds no approach, it is looked for again without a straight and much slower rise, a drift.
-    """
+    """How many readings were taken before contact; if too few, None, and what may be a drift of force [mN] before
+    loading."""
     contact = contact_index(find_segments(curve, control=control))
     if contact > AIR_READINGS:
         return contact, 0.0
@@ -173,6 +164,7 @@ def _air_until(curve: Curve, control: Control | None) -> tuple[int | None, float
     change = line.slope * float(curve.time_s[stop - 1] - curve.time_s[0])
     if share > DRIFT_SLOWER:
         return None, change
+    # The approach is looked for again without the drift.
     drift = line.at(np.minimum(curve.time_s, curve.time_s[stop - 1]))
     contact = contact_index(find_segments(replace(curve, force_mN=curve.force_mN - drift), control=control))
     return (contact if contact > AIR_READINGS else None), change
@@ -180,10 +172,7 @@ def _air_until(curve: Curve, control: Control | None) -> tuple[int | None, float
 
 def slow_start(curve: Curve) -> tuple[Line, int, float] | None:
     """A straight and slower course of force before loading, of a load cell that drifts: the line, how many readings it
-    has, and its slope as a share of loading's.
-
-    A slower speed of the test machine, which bends force and displacement alike, is none.
-    """
+    has, and its slope as a share of loading's."""
     force, time, path = curve.force_mN, curve.time_s, curve.displacement_um
     first = int(np.argmax(force > force[0] + START_SHARE * (force.max() - force[0])))
     if first < 2 * AIR_READINGS + 4:
@@ -199,6 +188,7 @@ def slow_start(curve: Curve) -> tuple[Line, int, float] | None:
     error = point_noise(force) * np.sqrt(1 / slow.spread + 1 / fast.spread)
     share, pace = slow.slope / max(fast.slope, 1e-300), way / max(on, 1e-300)
     distinct = fast.slope - slow.slope > DRIFT_SAID * error and share <= DRIFT_LIKE
+    # A slower speed of the test machine bends force and displacement alike.
     only_slower = pace > 0 and share > 0 and 1 / OTHER_STIFFNESS < share / pace < OTHER_STIFFNESS
     straight = np.std(slow.left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
     return (slow, kink, share) if distinct and straight and not only_slower else None

@@ -19,11 +19,10 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..files import SETTINGS_BYTES, read_regular
-from .columns import CANONICAL, FORCE, LENGTH, convert, find_column
 from .schema import Control, Metadata
-from .table import decode
+from .table import CANONICAL, convert, decode, find_column
 
-_QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
+_QUANTITIES = {"force_resolution": "force", "displacement_resolution": "length", "punch_diameter": "length"}
 _WRITE = {
     "control": '"load" or "displacement"',
     "provenance": 'it in quotes, provenance = "..."',
@@ -36,39 +35,31 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
     """Parse TOML; the line with a mistake is named."""
     try:
         entries = tomllib.loads(text)
-        _refuse_long_integers(entries, file)
     except RecursionError:
         raise InputError("is nested too deep", file=file, remedy="Write flat keys") from None
-    except InputError:
-        raise
     except ValueError as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
         row = int(place[1]) if place else text.rstrip().count("\n") + 1
         remedy = 'Write key = value lines, text in double quotes, for example control = "load"'
         raise InputError(f"this is not TOML: {problem}", file=file, row=row, remedy=remedy) from None
+    _refuse_long_integers(entries, file)
     return entries
 
 
 def _refuse_long_integers(value: Any, file: Path, key: str = "") -> None:
     """TOML promises integers of 64 bits only; a float may not hold a longer one."""
-    if isinstance(value, dict):
-        for name, one in value.items():
+    if isinstance(value, dict | list):
+        for name, one in value.items() if isinstance(value, dict) else ((key, one) for one in value):
             _refuse_long_integers(one, file, name)
-    elif isinstance(value, list):
-        for one in value:
-            _refuse_long_integers(one, file, key)
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         problem = "holds an integer of more than 64 bits"
         raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
 
 
 def typed[T](entries: Mapping[str, Any], kind: type[T], file: Path, write: Mapping[str, str]) -> T:
-    """Entries of a TOML file as a `msgspec.Struct` that forbids unknown fields.
-
-    Raises `InputError` naming the key that is unknown, missing or of another type. `write` holds what to write for a
-    key, by its last part.
-    """
+    """Entries of a TOML file as a `msgspec.Struct` that forbids unknown fields; `InputError` names the key that is
+    unknown, missing or of another type. `write` holds what to write for a key, by its last part."""
     try:
         return msgspec.convert(entries, kind)
     except msgspec.ValidationError as error:
@@ -116,9 +107,6 @@ class _Known(msgspec.Struct):
 def parse_metadata(text: str, file: Path) -> Metadata:
     """The metadata that the text of a `campaign.toml` holds; keys it does not know go to `other`."""
     entries = load_toml(text, file)
-    for key in entries:
-        if key.lower() != key and key.lower() in (*_WRITE, *_QUANTITIES):
-            raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {key.lower()!r}?")
     known = typed({key: entries.pop(key) for key in _WRITE if key in entries}, _Known, file, _WRITE)
     sizes = {
         f"{quantity}_{CANONICAL[dimension]}": _positive(entries, quantity, dimension, file)
@@ -133,13 +121,12 @@ def _positive(entries: dict[str, Any], quantity: str, dimension: str, file: Path
     if not any(quantity in (key, key.rpartition("_")[0]) for key in keys):
         return None
     where, factor = find_column(keys, quantity, dimension, file, what="key")
-    value = entries.pop(keys[where])
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    number = float(convert(np.array([float(value)]), factor)[0]) if plain else math.nan
-    if not 0 < number < math.inf:
+    try:
+        value = arguments.number(entries.pop(keys[where]), "it", above=0)
+    except InputError as error:
         remedy = "Write the number alone, without quotes and unit, or remove the key"
-        raise InputError(f"{str(value)[:40]!r} is not a positive number", file=file, column=keys[where], remedy=remedy)
-    return number
+        raise error.changed(file=file, column=keys[where], remedy=remedy) from None
+    return float(convert(np.array([value]), factor)[0])
 
 
 def format_metadata(metadata: Metadata, file: Path) -> str:

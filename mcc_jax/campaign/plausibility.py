@@ -1,13 +1,9 @@
 """Whether a campaign's numbers can be those of compressed particles, and which wrong unit or sign would explain them.
 
-Every hypothesis is judged by the same wide ranges: the numbers as given, and the numbers with one unit error undone
-(`unit_errors`). One is named where undoing it brings the tests from far outside the ranges to inside: its log odds
-against "as given" are the difference of the log densities plus its prior log odds (a Bayes factor).
-
-What cannot be seen: a factor that leaves everything within the ranges. Loading, unloading and their ratio say the same
-of a sphere of half the size with a modulus 1.4 times as large: radii given for diameters show only where the platens
-would have touched. A fitted modulus points to no unit: a wrong one moves it and the records' own stiffness by the same
-factor (both go as force / (displacement^1.5 diameter^0.5)).
+A unit error is named where undoing it (`unit_errors`) brings the tests from far outside wide ranges to inside: its log
+odds against "as given" are the difference of the log densities plus its prior log odds (a Bayes factor). A factor that
+leaves everything within the ranges cannot be seen. A fitted modulus points to no unit: a wrong one moves it and the
+records' own stiffness by the same factor.
 """
 
 from __future__ import annotations
@@ -18,31 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from . import unit_errors
 from .findings import Finding, Level, worst
 from .paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
-from .schema import Campaign, Curve, remembered
-from .unit_errors import (
-    CLOCKS,
-    DIAMETER_UM,
-    INTERVAL_S,
-    LOADING_S,
-    SOLIDS,
-    UNIT_ERROR,
-    CurveFeatures,
-    Range,
-    UnitError,
-    apparent,
-    beyond,
-    closure,
-    curve_features,
-    hypotheses,
-    in_words,
-    is_radius,
-    log_density,
-    log_numbers,
-    undo,
-)
-from .validate import check_campaign
+from .schema import Campaign, Curve, check_campaign, remembered
+from .unit_errors import CurveFeatures, UnitError, apparent, beyond, curve_features, in_words, log_density
 
 ODDS = 3.0  # log odds from which on an error is reported: 20 to 1
 ALIKE = 1.0  # log odds within which a second hypothesis is named, too
@@ -57,17 +33,12 @@ STIFFER = 3.0
 
 @np.errstate(all="ignore")
 def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) -> tuple[Finding, ...]:
-    """Report what a wrong unit, sign or column would explain in a campaign.
+    """Report what a wrong unit, sign or column would explain in a campaign; nothing is changed or refused.
 
-    Judges raw tests, before any fit: each test's peak, the stiffness of loading and unloading, the work given back, its
-    sizes and its times. Of a checked campaign those that it was made from. Nothing is changed, and nothing is refused.
-    The effective modulus of a fit is compared with the moduli of solids.
-
-    Returns:
-        Findings: "error" for a likely error, with the column and the remedy, and for numbers that no solid has; "info"
-        where the material is not like microcrystalline cellulose, which is no fault. What concerns a fitted modulus is
-        of the check "fitted modulus" and points to no unit; all else is of the check "plausibility".
-        `Finding.particles` names the particles where not all are concerned.
+    Judges the raw tests: each test's peak, the stiffness of loading and unloading, the work given back, its sizes and
+    its times; and the effective modulus of a fit. A finding is an "error" for a likely error, with the column and the
+    remedy, and for numbers that no solid has; "info" where the material is not like microcrystalline cellulose. It
+    names the particles where not all are concerned.
     """
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
@@ -80,18 +51,16 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
 
 
 class Material(NamedTuple):
-    """Another material than microcrystalline cellulose: median peak stress, strain there times the paper's shape
-    factor, and a remark that it is stiffer or softer."""
+    """Another material than microcrystalline cellulose."""
 
-    stress_MPa: float
-    strain: float
-    remark: Finding
+    stress_MPa: float  # median at the peaks
+    strain: float  # there, times the paper's shape factor
+    remark: Finding  # that it is stiffer or softer
 
 
 @np.errstate(all="ignore")
 def other_material(campaign: Campaign) -> Material | None:
-    """The material of the tests; None if they are like microcrystalline cellulose, or a wrong unit or sign is more
-    likely."""
+    """The material of the tests; None if it is the paper's, or a wrong unit or sign is more likely."""
     tests = _tests(check_campaign(campaign))
     return None if not tests.names or worst(tests.findings) == "error" else _material(tests)
 
@@ -123,8 +92,8 @@ class _Tests:
 
     @cached_property
     def numbers(self) -> np.ndarray:
-        """What `log_numbers` makes of them."""
-        return log_numbers(self.features, self.diameters_um)
+        """What `unit_errors.log_numbers` makes of them."""
+        return unit_errors.log_numbers(self.features, self.diameters_um)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -165,10 +134,11 @@ def _finding(sentence: str, remedy: str, names: tuple[str, ...] = (), level: Lev
 
 def _units(tests: _Tests) -> list[Finding]:
     """Wrong units and swapped columns, of the whole campaign, of a group of its tests and of single particles."""
-    errors = hypotheses()
+    errors = unit_errors.hypotheses()
     prior = np.array([one.prior for one in errors])
-    swapped = log_numbers(_columns([_features(curve, swapped=True) for curve in tests.curves]), tests.diameters_um)
-    undone = undo(tests.numbers, swapped, errors)
+    exchanged = _columns([_features(curve, swapped=True) for curve in tests.curves])
+    swapped = unit_errors.log_numbers(exchanged, tests.diameters_um)
+    undone = unit_errors.undo(tests.numbers, swapped, errors)
     odds = log_density(undone) + prior
     whole = np.median(odds, axis=0)
     found = []
@@ -183,9 +153,9 @@ def _units(tests: _Tests) -> list[Finding]:
         corrected[group] = undone[group, np.argmax(total)]
         settled |= group
     if len(tests.names) >= 4:
-        single = _unlike_the_others(undo(corrected, swapped, errors), corrected)
+        single = _unlike_the_others(unit_errors.undo(corrected, swapped, errors), corrected)
         # One soft particle may come close to flat; radii show only in what all of them do.
-        single += np.where([is_radius(one) for one in errors], -np.inf, prior)
+        single += np.where([unit_errors.is_radius(one) for one in errors], -np.inf, prior)
         groups = [group & ~settled for group in _agreeing(single)]
         found += [(np.median(single[group], axis=0), group) for group in groups if group.any()]
     return [_unit_finding(tests, errors, total, group) for total, group in found]
@@ -246,32 +216,27 @@ def _signs(tests: _Tests) -> list[Finding]:
         (force & ~displacement, ("force_mN",), "the load rises as the force falls below zero"),
         (~force & displacement, ("displacement_um",), "the displacement falls as the force rises"),
     ):
-        if not (real & turned).any():
-            continue
-        names = tests.some(real & turned)
-        channels = [column.partition("_")[0] for column in columns]
-        what = f"{' and '.join(f'{channel}s' for channel in channels)} of {_who(names)}"
-        remedy = f"reverse the sign of {' and '.join(columns)} in curves.csv, or write sign = -1 for"
-        found.append(
-            _finding(
-                f"the {what} seem to have the wrong sign: {seen}, and compression is positive here",
-                f"{remedy} {' and '.join(channels)} in the mapping file",
-                names,
-            )
-        )
+        if (real & turned).any():
+            names = tests.some(real & turned)
+            channels = [column.partition("_")[0] for column in columns]
+            what = f"the {' and '.join(f'{channel}s' for channel in channels)} of {_who(names)}"
+            sentence = f"{what} seem to have the wrong sign: {seen}, and compression is positive here"
+            remedy = f"reverse the sign of {' and '.join(columns)} in curves.csv, or write sign = -1 for"
+            found.append(_finding(sentence, f"{remedy} {' and '.join(channels)} in the mapping file", names))
     return found
 
 
 def _clock(features: CurveFeatures) -> list[Finding]:
     """Times in a wrong unit."""
     loading, interval = np.log10(features.loading_s)[:, None], np.log10(features.interval_s)[:, None]
-    shifts, prior = np.array([(one.decades[-1], one.prior) for one in CLOCKS]).T
-    outside = beyond(loading + shifts, np.log10(LOADING_S)) + beyond(interval + shifts, np.log10(INTERVAL_S))
+    shifts, prior = np.array([(one.decades[-1], one.prior) for one in unit_errors.CLOCKS]).T
+    outside = beyond(loading + shifts, np.log10(unit_errors.LOADING_S))
+    outside = outside + beyond(interval + shifts, np.log10(unit_errors.INTERVAL_S))
     odds = np.median(np.where(np.isfinite(loading), -outside, 0.0), axis=0) + prior
     best = int(np.argmax(odds))
     if best == 0 or odds[best] < odds[0] + ODDS:
         return []
-    likely, remedy = in_words(CLOCKS[best])
+    likely, remedy = in_words(unit_errors.CLOCKS[best])
     pace = f"loading takes {_number(_median(loading))} s with a reading every {_number(_median(interval))} s"
     return [_finding(f"{likely}: as given, {pace}", remedy)]
 
@@ -285,7 +250,7 @@ def _order_of_diameters(diameters_um: np.ndarray) -> list[Finding]:
     ranks = np.argsort(np.argsort(sizes, axis=1), axis=1)
     by_order = np.log(RANK_AT_REST)[ranks].sum(axis=0)
     # As given, or bodies that lie anyhow.
-    odds = by_order[:2] + UNIT_ERROR - np.logaddexp(by_order[2], len(sizes) * np.log(1 / 3))
+    odds = by_order[:2] + unit_errors.UNIT_ERROR - np.logaddexp(by_order[2], len(sizes) * np.log(1 / 3))
     best = int(np.argmax(odds))
     if odds[best] < ODDS:
         return []
@@ -301,7 +266,7 @@ def _order_of_diameters(diameters_um: np.ndarray) -> list[Finding]:
 def _outside(tests: _Tests) -> list[Finding]:
     """Numbers beyond every range though no unit error explains them."""
     found: list[Finding] = []
-    closed = closure(tests.numbers) > 0
+    closed = unit_errors.closure(tests.numbers) > 0
     if closed.any():
         names = tests.some(closed)
         sentence = f"the displacement of {_who(names)} exceeds the diameter D3, so that the platens would have touched"
@@ -310,7 +275,7 @@ def _outside(tests: _Tests) -> list[Finding]:
     numbers = _typical(tests.numbers)
     it = apparent(numbers)
     for what, unit, value, (low, high) in (
-        ("diameter", "um", numbers[2:5].mean(), DIAMETER_UM),
+        ("diameter", "um", numbers[2:5].mean(), unit_errors.DIAMETER_UM),
         ("stress", "MPa", it.stress_MPa, _hull("stress_MPa")),
         ("stiffness of loading", "MPa", it.loading_modulus_MPa, _hull("loading_modulus_MPa")),
         ("modulus of unloading", "MPa", it.modulus_MPa, _hull("modulus_MPa")),
@@ -361,9 +326,9 @@ def _material(tests: _Tests) -> Material | None:
     return Material(float(10**stress), float(np.nanmedian(x)), _finding(remark, "", level="info"))
 
 
-def _hull(name: str) -> Range:
+def _hull(name: str) -> unit_errors.Range:
     """The range of all classes of solids together."""
-    lows, highs = zip(*(getattr(solid, name) for solid in SOLIDS), strict=True)
+    lows, highs = zip(*(getattr(solid, name) for solid in unit_errors.SOLIDS), strict=True)
     return min(lows), max(highs)
 
 

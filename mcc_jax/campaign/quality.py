@@ -1,16 +1,8 @@
 """Faults of tests and instruments: found, reported in words, and corrected where the record allows.
 
-`check_tests` applies these checks to every test in this order; each sees what those before it left.
-
-1. single readings far from all their neighbours (spikes) are left out;
-2. readings that repeat while the test goes on, and then catch up in one jump (a stuck channel), are left out;
-3. a record that begins at its largest force has lost its loading, which is reported;
-4. a sudden loss of force (the particle broke) ends the record; where force falls while the platens close as fast as
-   before (it gives way or slips), readings are left out until the force is back, or to the end;
-5. the mean force before contact is the zero of force: it is taken off, its error is kept (`force_zero`);
-6. readings at the end of a channel's range are not compared with the law (`saturation`).
-
-A test in which nothing is found stays what it is, to the last bit.
+`check_tests` looks for spikes, stuck channels, lost loading, breakage, the zero of force (`force_zero`) and channels at
+the end of their range (`saturation`), in this order; each check sees what those before it left. A test in which nothing
+is found stays what it is, to the last bit.
 """
 
 from __future__ import annotations
@@ -23,10 +15,9 @@ from .findings import Finding, joined
 from .force_zero import NOT_TARED, shared_zero, zero_of_force
 from .plausibility import wrong_signs
 from .saturation import censor_displacement, censor_force
-from .schema import Campaign, Checked, Control, Curve
+from .schema import Campaign, Checked, Control, Curve, check_campaign
 from .segments import find_segments
 from .signal import differences, median, point_noise, quantile, runs, stretches
-from .validate import check_campaign
 
 # Every threshold is such that no sound record reaches it.
 SPIKE_NOISE = 15.0  # standard deviations; of 1e6 normal readings the farthest lies at 5, the rest is for other noise
@@ -81,13 +72,9 @@ GIVES_WAY = Finding(
 def check_tests(campaign: Campaign, *, zero_mN: tuple[float, float] | None = None) -> Campaign:
     """The campaign with the faults of its tests found, corrected where the record allows, and reported.
 
-    Args:
-        campaign: raw tests. One that was checked already comes back as it is.
-        zero_mN: zero of force of records that begin in contact, and its error [mN]; the file's own if None.
-
-    Returns:
-        A campaign whose curves hold the readings that count, with the zero of force taken off; `raw` is the campaign
-        that was given, and `campaign_findings` says what was found.
+    Its curves hold the readings that count, with the zero of force taken off; `raw` is the campaign that was given, and
+    `campaign_findings` says what was found. One that was checked already comes back as it is. Records that begin in
+    contact have the zero of force and its error `zero_mN`, or the file's own.
     """
     check_campaign(campaign)
     if campaign.raw is not None:
@@ -110,7 +97,6 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
 
 
 def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None) -> Curve:
-    """One test, checked; see the top of the file for the checks."""
     clean, rows = curve, np.arange(len(curve))
     found: list[Finding] = []
 
@@ -209,12 +195,9 @@ def begins_at_peak(curve: Curve) -> bool:
 
 
 def breakage(curve: Curve) -> tuple[int, float] | None:
-    """The last reading before the particle broke, and the share of its force that it lost at once; None if it held.
-
-    The force falls within a few readings, much faster than elsewhere, while the platens do not separate, and does not
-    come back at once. A jump of displacement under load control is no sign of it: a law that is not monotone snaps
-    through, and many particles pop in.
-    """
+    """The last reading before the particle broke, and the share of its force that it lost at once; None if it held."""
+    # The force falls within a few readings, much faster than elsewhere, while the platens do not separate, and does not
+    # come back at once. A jump of displacement under load control is no sign of it: many particles pop in.
     force, path, time = curve.force_mN, curve.displacement_um, curve.time_s
     count = len(force)
     if count < 12:
@@ -247,11 +230,9 @@ def breakage(curve: Curve) -> tuple[int, float] | None:
 
 
 def gives_way(curve: Curve, control: Control | None) -> np.ndarray:
-    """Which readings come after the particle gave way or slipped, until its force is back; booleans.
-
-    Force falls while the platens go on closing at about the speed they had. In unloading they separate or, of a stiff
-    particle that creeps, stand still.
-    """
+    """Which readings come after the particle gave way or slipped, until its force is back; booleans."""
+    # Force falls while the platens go on closing at about the speed they had. In unloading they separate or, of a stiff
+    # particle that creeps, stand still.
     force, path, time = curve.force_mN, curve.displacement_um, curve.time_s
     found = np.zeros(len(curve), bool)
     if len(curve) < 12:

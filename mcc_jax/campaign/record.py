@@ -8,17 +8,16 @@ from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .. import arguments
 from .._errors import InputError
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need, Record
 from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
 from .adjustment import campaign_segments
-from .schema import Campaign, Curve
+from .schema import Campaign, Curve, check_campaign
 from .segments import Segment
 from .signal import Line
-from .validate import check_campaign
 
 JUMP = 1.3  # factor by which rates of force differ at least; less is what the control of test machines leaves
 READINGS = 6  # of a ramp from which on changes of its speed are looked for: two lines that meet have four numbers
@@ -28,9 +27,8 @@ KINKS = 6  # of a ramp at most: a change between two readings makes two
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
     """The record of a measured test, cut by `find_segments`.
 
-    Rates are the slopes of straight lines through segments, or through their parts where the programme changes its
-    speed (`ramp_rates`). The forces where branches begin come from straight lines through their first points. Without a
-    humidity of the test it is the reference, at which no effect of humidity acts.
+    Rates are the slopes of straight lines through segments (`ramp_rates`). The forces where branches begin come from
+    straight lines through their first points. Without a humidity of the test it is the reference, which has no effect.
     """
     columns = record_columns(curve, segments, relative_humidity_percent=relative_humidity_percent)
     return Record(**{name: jnp.asarray(values) for name, values in columns.items()})
@@ -90,35 +88,8 @@ def record_columns(
     return {"force": force, "time": time, **columns, "relative_humidity": np.asarray(humidity, dtype=float)}
 
 
-def record_batch(
-    campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None, *, multiple: int = 1
-) -> Record:
-    """The records of all tests of a campaign with a leading axis N, shorter ones padded with their last point.
-
-    Segments are found if they are None; the length is rounded up to a multiple of `multiple`.
-    """
-    check_campaign(campaign)
-    multiple = arguments.whole(multiple, "multiple", least=1)
-    found = campaign_segments(campaign) if segments is None else segments
-    humidity = humidities(campaign)
-    records = [
-        record_columns(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
-        for i, (curve, parts) in enumerate(zip(campaign.curves, found, strict=True))
-    ]
-    longest = max(len(curve) for curve in campaign.curves)
-    longest += -longest % multiple
-
-    def together(rows: list[np.ndarray]) -> Array:
-        return jnp.asarray(np.stack([np.pad(r, (0, longest - len(r)), mode="edge") if r.ndim else r for r in rows]))
-
-    return Record(**{name: together([one[name] for one in records]) for name in records[0]})
-
-
 def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
-    """Relative humidity [%] of every test from the column `relative_humidity_percent`; None without that column.
-
-    An entry that is no number from 0 to 100 raises `InputError` with its particle.
-    """
+    """Relative humidity [%] of every test; None without its column, `InputError` for an entry that is none."""
     return humidity_column(campaign.particles, campaign.columns, campaign.source)
 
 
@@ -144,10 +115,9 @@ def humidity_column(
 def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], before: float) -> Float[np.ndarray, " n"]:
     """Force rate at every reading of a ramp: of one straight line, or of several where the programme changes its speed.
 
-    A change of speed is a kink. Kinks are believed where straight lines that meet describe the force better than one
-    line and than any polynomial of as many numbers, by the Bayesian information criterion (Schwarz 1978; a kink counts
-    as three numbers, Zhang and Siegmund 2007): a force that bends smoothly, as under a steady platen, keeps one mean
-    rate. The rate changes behind the reading at a kink; a ramp without duration keeps the rate `before` it.
+    Changes of speed are kinks, believed where straight lines that meet describe the force better than one line and than
+    any polynomial of as many numbers, by the Bayesian information criterion (Schwarz 1978; a kink counts as three
+    numbers, Zhang and Siegmund 2007). A ramp without duration keeps the rate `before` it.
     """
     if len(time) < 2 or np.ptp(time) <= 0:
         return np.full(len(time), before)
@@ -223,10 +193,10 @@ def _best_kink(x: np.ndarray, y: np.ndarray) -> tuple[float, int]:
 
 
 def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
-    """What a campaign holds of what effects need.
+    """What a campaign holds of what effects need; segments are found if they are None.
 
     A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
-    tenth; peaks and rates when the largest is 1.3 times the smallest. Segments are found if they are None.
+    tenth; peaks and rates when the largest is 1.3 times the smallest.
     """
     check_campaign(campaign)
     found = campaign_segments(campaign) if segments is None else segments

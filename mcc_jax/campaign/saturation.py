@@ -1,8 +1,7 @@
 """A channel at the end of its range: readings that repeat the extreme while the other channel goes on.
 
-The true value lies beyond. Displacement is what the law is compared in, so its readings at the end of the range are not
-compared. Force is what the law is driven with, and its largest value decides the whole unloading: the loading curve
-below the end of the range, in the law's own form
+Displacement is what the law is compared in, so its readings at the end of the range are not compared. Force is what the
+law is driven with, and its largest value decides the whole unloading: the loading curve below the end of the range
 
 .. math:: F = k_1 x - k_3 x^3 + k_5 x^5, \\qquad x = (d - z) / D_e
 

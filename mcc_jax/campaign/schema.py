@@ -1,12 +1,13 @@
-"""A campaign in memory: which particles were tested, what was measured, and how."""
+"""A campaign in memory: which particles were tested, what was measured, how, and what makes it valid."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import compress
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -14,12 +15,16 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described, number, span, table
 from .findings import Finding
+from .table import LARGEST_MAGNITUDE
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Control = Literal["load", "displacement"]
 CHANNELS = ("time_s", "force_mN", "displacement_um")
+SMALLEST_DIAMETER_UM = 1e-6
+_ALIKE = ("control", "punch_diameter_um", "corrections")
+_RESOLUTIONS = ("force_resolution_mN", "displacement_resolution_um")
 
 
 def remembered[T](of: Curve | Campaign, question: Hashable, find: Callable[[], T]) -> T:
@@ -40,23 +45,13 @@ def _fixed(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Checked:
-    """What `check_tests` did to a test; all arrays have one entry for each reading that is left.
+    """What `check_tests` did to a test; arrays have one entry for each reading that is left."""
 
-    Attributes:
-        rows: the readings of the raw record that are left, shape (n,).
-        compared: whether a reading may be compared with a law; a turning point that the force channel did not see may
-            not, since its force was worked out from the displacement.
-        force_zero_mN: the zero of force that was taken off [mN].
-        force_zero_sd_mN: its standard deviation [mN]: an error that all readings share.
-        force_sd_mN: standard deviation of a force that was worked out, 0 of one that was read [mN].
-        findings: what was found.
-    """
-
-    rows: np.ndarray
-    compared: np.ndarray
-    force_zero_mN: float
-    force_zero_sd_mN: float
-    force_sd_mN: np.ndarray
+    rows: np.ndarray  # the readings of the raw record that are left
+    compared: np.ndarray  # whether a reading may be compared with a law
+    force_zero_mN: float  # that was taken off
+    force_zero_sd_mN: float  # an error that all readings share
+    force_sd_mN: np.ndarray  # of a force that was worked out from the displacement, 0 of one that was read
     findings: tuple[Finding, ...]
 
 
@@ -70,8 +65,7 @@ class Curve:
         displacement_um: relative displacement of the two platens [um], shape (n,).
         checked: what `check_tests` changed, of a curve that it made; None of a raw one.
 
-    Lists, Series and arrays of any kind become NumPy arrays that cannot be written to; anything else, or columns of
-    different lengths, raises `InputError`.
+    Lists, Series and arrays of any kind become NumPy arrays that cannot be written to.
     """
 
     time_s: np.ndarray
@@ -113,14 +107,11 @@ class Metadata:
 
     Attributes:
         control: the controlled quantity, "load" or "displacement".
-        force_resolution_mN: smallest step of the force read-out [mN].
-        displacement_resolution_um: smallest step of the displacement read-out [um].
-        punch_diameter_um: diameter of the flat punch [um].
+        force_resolution_mN, displacement_resolution_um: smallest steps of the read-outs.
+        punch_diameter_um: diameter of the flat punch.
         provenance: where the data come from, in words.
         corrections: names of corrections that were applied before the data got here.
         other: every further entry of the file, kept as it is.
-
-    A control that does not exist, and a resolution or diameter that is not positive, raise `InputError`.
     """
 
     control: Control | None = None
@@ -152,11 +143,10 @@ class Campaign:
         curves: one test per particle, in the same order.
         columns: further columns of `particles.csv`, each N values, as text.
         metadata: what is known about the test.
-        source: the folder or file it was read from, for messages; empty when made in memory.
-        raw: of a campaign that `check_tests` made, the one it was made from; None otherwise.
+        source: the folder or file it was read from, for messages.
+        raw: of a campaign that `check_tests` made, the one it was made from.
 
-    `campaign["P3"]` is the test of that particle, a `Curve`, and a loop over a campaign gives its tests in order. Lists
-    and Series are converted; wrong kinds or different lengths raise `InputError`.
+    `campaign["P3"]` is the test of that particle, a `Curve`, and a loop over a campaign gives its tests in order.
     """
 
     particles: tuple[str, ...]
@@ -219,29 +209,25 @@ class Campaign:
         raise InputError(f"there is no particle {arguments.shown(particle)}", remedy=remedy)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """All readings as a table with the columns of `curves.csv`, one row each.
-
-        They are `particle`, `time_s`, `force_mN` and `displacement_um`.
-        """
+        """All readings as a table with the columns of `curves.csv`, one row each."""
         import pandas as pd
 
-        lengths = [len(curve) for curve in self.curves]
+        names = np.repeat(np.array(self.particles, object), [len(curve) for curve in self.curves])
         columns = {name: np.concatenate([getattr(curve, name) for curve in self.curves]) for name in CHANNELS}
-        return pd.DataFrame({"particle": np.repeat(np.array(self.particles, object), lengths), **columns})
+        return pd.DataFrame({"particle": names, **columns})
 
     def select(self, keep: np.ndarray) -> Campaign:
         """The campaign of those particles where `keep`, booleans of shape (N,), is true."""
         keep = np.asarray(keep)
         if keep.dtype != bool or keep.shape != (len(self),):
             raise InputError(f"keep must be {len(self)} booleans, one for every particle, got {arguments.shown(keep)}")
-        return Campaign(
-            compress(self.particles, keep),
-            self.diameters_um[keep],
-            compress(self.curves, keep),
-            {name: list(compress(values, keep)) for name, values in self.columns.items()},
-            self.metadata,
-            self.source,
-            None if self.raw is None else self.raw.select(keep),
+        return replace(
+            self,
+            particles=compress(self.particles, keep),
+            diameters_um=self.diameters_um[keep],
+            curves=compress(self.curves, keep),
+            columns={name: list(compress(values, keep)) for name, values in self.columns.items()},
+            raw=None if self.raw is None else self.raw.select(keep),
         )
 
     def without(self, *particles: str) -> Campaign:
@@ -258,10 +244,118 @@ _SIZES = "D1, D2, D3 [um] of every particle, shape (N, 3)"
 
 def _texts(values: Any, name: str) -> tuple[str, ...]:
     """Several texts; numbers become texts, a single text is none of several."""
-    if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
+    if isinstance(values, str | bytes | Mapping):
         raise InputError(f"{name} must be a list of texts, got {arguments.kind_of(values)}")
     found = list(values)
-    wrong = [one for one in found if not isinstance(one, str | int | float | np.number) or isinstance(one, bool)]
-    if wrong:
-        raise InputError(f"{name} must be a list of texts, got {arguments.shown(wrong[0])} among them")
-    return tuple(one if isinstance(one, str) else f"{one}" for one in found)
+    for one in found:
+        if not isinstance(one, str | int | float | np.number) or isinstance(one, bool):
+            raise InputError(f"{name} must be a list of texts, got {arguments.shown(one)} among them")
+    return tuple(map(str, found))
+
+
+# ---- what every campaign must satisfy, read from files, made in memory or joined from several ------------------------
+
+
+class Fault(NamedTuple):
+    """Why no test can be as it is, and the first reading and the channel concerned; that is empty for all of them."""
+
+    problem: str
+    remedy: str
+    reading: int = 0
+    channel: str = ""
+
+
+def fault_of(name: str, curve: Curve) -> Fault | None:
+    """What is wrong with a test whatever its particle is: readings that are no numbers, or too few, times, zeros."""
+    channels = {"time": curve.time_s, "force": curve.force_mN, "displacement": curve.displacement_um}
+    for channel, values in channels.items():
+        bad = np.flatnonzero(~(np.abs(values) <= LARGEST_MAGNITUDE))
+        if bad.size:
+            value, remedy = values[bad[0]], "Leave that sample out, or check the unit if all are so large"
+            what = "" if np.isnan(value) else ", too large to be real"
+            return Fault(f"the {channel} of test {name!r} is {value:.4g}{what}", remedy, int(bad[0]), channel)
+    if len(curve) < 2:
+        remedy = "A curve needs at least two rows; add them or remove the particle"
+        return Fault(f"the test {name!r} has one row only", remedy)
+    back = np.flatnonzero(np.diff(curve.time_s) < 0)
+    if back.size:
+        i = int(back[0])
+        problem = f"the time of test {name!r} goes back, from {curve.time_s[i]:.10g} s to {curve.time_s[i + 1]:.10g} s"
+        return Fault(problem, "Keep the rows of a test in the order of time; two tests need two names", i + 1, "time")
+    for channel in ("force", "displacement"):
+        if not channels[channel].any():
+            problem = f"every {channel} of test {name!r} is zero, so it holds no data"
+            return Fault(problem, "Export the test again or remove the particle", 0, channel)
+    return None
+
+
+def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = "") -> Campaign:
+    """The campaign, if it could have come from files: `InputError` if names, shapes or values are unfit, naming `file`
+    or the place where it was read; given a path, it shows how to read it."""
+    if isinstance(campaign, str | PurePath):
+        remedy = f"Read it first: mcc_jax.read_campaign({str(campaign)!r})."
+        raise InputError(f"{name} must be a Campaign, got the path {str(campaign)!r}", remedy=remedy)
+    found = remembered(campaign, "problem", lambda: next(_problems(campaign), None))
+    if found is not None:
+        problem, remedy = found
+        raise InputError(problem, file=file or campaign.source or f"the {name}", remedy=remedy)
+    return campaign
+
+
+def _problems(campaign: Campaign) -> Iterator[tuple[str, str]]:
+    """What is wrong with a campaign, and what to do about it."""
+    remedy = "Correct the campaign before it is used"
+    if not len(campaign):
+        yield "there is no particle", remedy
+    for name, times in Counter(campaign.particles).items():
+        if times > 1:
+            yield f"the particle {name!r} appears {times} times", remedy
+    for name, triple, curve in zip(campaign.particles, campaign.diameters_um, campaign.curves, strict=True):
+        if not name.strip():
+            yield "a particle's name is empty", remedy
+        if not ((triple >= SMALLEST_DIAMETER_UM) & (triple <= LARGEST_MAGNITUDE)).all():
+            yield f"the diameters {triple.tolist()} um of particle {name!r} are not all positive and finite", remedy
+        if (fault := fault_of(name, curve)) is not None:
+            yield f"{fault.problem} (sample {fault.reading + 1})", fault.remedy
+    for column in campaign.columns:
+        taken = column == "particle" or column.startswith(("D1_", "D2_", "D3_"))
+        if taken or not column or column != column.strip() or "\ufeff" in column:
+            yield f"{column!r} cannot be the name of a further column", remedy
+    for texts in (campaign.particles, campaign.columns, *campaign.columns.values()):
+        for text in texts:
+            if "\0" in text or text.encode("utf-8", "ignore").decode("utf-8") != text:
+                yield f"the text {text!r} holds a NUL character or is no valid Unicode text", remedy
+
+
+def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
+    """The tests of several campaigns as one, for instance those that a discovery proposed in addition to those it had.
+
+    Programmes of load may differ. Of resolutions the coarsest counts, provenances are listed, and of further entries
+    of `campaign.toml` with one name the first campaign's stays. The same name twice, and different columns, control,
+    punch or corrections raise `InputError`.
+    """
+    campaigns = tuple(check_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
+    for other in further:
+        alike = {name: (getattr(first.metadata, name), getattr(other.metadata, name)) for name in _ALIKE}
+        for what, (one, another) in {"columns": (sorted(first.columns), sorted(other.columns)), **alike}.items():
+            if one != another:
+                problem = f"{what} is {another!r} here and {one!r} in the first campaign"
+                remedy = "Such tests are not of one kind; evaluate them separately, or correct the entry"
+                raise InputError(problem, file=other.source or None, remedy=remedy)
+    known = [campaign.metadata for campaign in campaigns]
+    resolutions = {name: [value for one in known if (value := getattr(one, name)) is not None] for name in _RESOLUTIONS}
+    metadata = replace(
+        known[0],
+        **{name: max(values, default=None) for name, values in resolutions.items()},
+        provenance="; ".join(dict.fromkeys(one.provenance for one in known if one.provenance)) or None,
+        other={name: value for one in reversed(known) for name, value in one.other.items()},
+    )
+    joined = Campaign(
+        [name for campaign in campaigns for name in campaign.particles],
+        np.concatenate([campaign.diameters_um for campaign in campaigns]),
+        [curve for campaign in campaigns for curve in campaign.curves],
+        {name: [cell for c in campaigns for cell in c.columns[name]] for name in first.columns},
+        metadata,
+        ", ".join(dict.fromkeys(campaign.source for campaign in campaigns if campaign.source)),
+    )
+    return check_campaign(joined)

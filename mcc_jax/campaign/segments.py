@@ -1,10 +1,8 @@
 """Cutting a test into approach, load, hold, unload and reload.
 
-The signal that the test machine controls (force or displacement) is cut at its turning points, found by hysteresis: a
-turn counts once the signal has gone back by more than the noise and more than a small share of its range. A hold is
-where the signal stays within a narrow band for several times longer than the neighbouring ramps need to cross it. What
-comes before the force begins to rise is the approach. All thresholds are shares of the curve's own range, or multiples
-of its own noise.
+The signal that the test machine controls is cut at its turning points: a turn counts once the signal has gone back by
+more than its noise and more than a small share of its range. A hold is where it stays within a narrow band for several
+times longer than the neighbouring ramps need to cross it. What comes before the force begins to rise is the approach.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -36,23 +34,13 @@ SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
 class Segment:
     """A stretch of a curve, samples `start` to `stop - 1`.
 
-    Attributes:
-        kind: "approach" before contact, "load" beyond any force reached before, "hold" while the controlled
-            quantity stands still, "unload", or "reload" up to the greatest force reached before.
-        start: index of the first sample.
-        stop: index behind the last sample.
+    The kind is "approach" before contact, "load" beyond any force reached before, "hold" while the controlled quantity
+    stands still, "unload", or "reload" up to the greatest force reached before.
     """
 
     kind: SegmentKind
     start: int
     stop: int
-
-    def __post_init__(self) -> None:
-        arguments.choice(self.kind, get_args(SegmentKind), "kind")
-        for name in ("start", "stop"):
-            object.__setattr__(self, name, arguments.whole(getattr(self, name), name))
-        if self.stop < self.start:
-            raise InputError(f"a segment from sample {self.start} stops at {self.stop}, before it starts")
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -62,40 +50,15 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
     """Cut a test into segments that follow each other without gap or overlap.
 
     A reload that goes beyond the greatest force reached before is cut there: what follows is virgin "load". Where the
-    force stays at its lowest level while the platen moves away, that is still "unload". A turn must be deeper than
-    eight times the noise's standard deviation, which is estimated from the curve. A turning point belongs to the
+    force stays at its lowest level while the platen moves away, that is still "unload". A turning point belongs to the
     segment that starts there.
 
-    Args:
-        curve: the test, raw.
-        control: the controlled quantity. By default it is judged from the data: displacement where it stands still
-            while the force relaxes, else force.
-
-    Returns:
-        The segments in order, from 0 to the number of samples.
-
-    Raises:
-        InputError: for a curve without a point or with one that is not finite.
+    By default the controlled quantity is judged from the data: displacement where it stands still while the force
+    relaxes, else force. A curve without a point, or with one that is not finite, raises `InputError`.
     """
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
     return remembered(curve, ("segments", control), lambda: _found(curve, control))
-
-
-def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict[str, Any]]:
-    """One row per segment for printing: its kind and number of samples, and its first and last time, force and
-    displacement."""
-    rows: list[dict[str, Any]] = []
-    for part in segments:
-        row: dict[str, Any] = {"kind": part.kind, "samples": len(part)}
-        for first, last, values in (
-            ("start_s", "stop_s", curve.time_s),
-            ("force_from_mN", "force_to_mN", curve.force_mN),
-            ("displacement_from_um", "displacement_to_um", curve.displacement_um),
-        ):
-            row |= {first: float(values[part.start]), last: float(values[part.stop - 1])}
-        rows.append(row)
-    return rows
 
 
 def contact_index(segments: Sequence[Segment]) -> int:
@@ -215,13 +178,8 @@ class Drive:
 
 
 def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
-    """The segments of a curve, see `find_segments`."""
-    if not len(curve):
-        raise InputError("the curve has no point", remedy="Give a test with two points or more.")
-    for name in CHANNELS:
-        bad = np.flatnonzero(~np.isfinite(getattr(curve, name)))
-        if bad.size:
-            raise InputError(f"the {name} of a curve is {getattr(curve, name)[bad[0]]} at sample {bad[0] + 1}")
+    if not len(curve) or not all(np.isfinite(getattr(curve, name)).all() for name in CHANNELS):
+        raise InputError("the curve has no point, or one that is not finite")
     clock = steady_clock(np.asarray(curve.time_s, float))
     drive = Drive(curve.force_mN, clock)
     if not drive.moves:
@@ -290,11 +248,8 @@ def _sags(holds: list[Hold], force: Drive) -> bool:
 
 
 def _contact_onset(force: Drive, displacement: np.ndarray) -> int:
-    """The index at which the force begins to rise; 0 if the curve begins in contact.
-
-    Up to a small force, a flat stretch and a rise lie far below the line from first to last point; a smooth rise does
-    not.
-    """
+    """The index at which the force begins to rise; 0 if the curve begins in contact."""
+    # Up to a small force, a flat stretch and a rise lie far below the line from first to last point, a smooth rise not.
     values, least = force.values, 10 * force.noise
     rise = max(CONTACT, least)
     peak = next((b for a, b in force.branches if values[b] - values[a] > 1.5 * rise), None)

@@ -22,16 +22,13 @@ SHORTEST_GAP = 0.2  # and a repeated time, at least: two readings are two
 
 
 def noise_level(values: np.ndarray, span: float) -> float:
-    """Standard deviation of the noise of a signal of shape (n,) and this range: differences that no smooth course has,
-    plus rounding.
-
-    In a signal of hundreds of quick cycles the noise is no more than what the differences between two turning points
-    show, nor than what cycles that repeat do from one to the next.
-    """
+    """Standard deviation of a signal's noise, given its range: differences that no smooth course has, plus rounding."""
     rounding = _resolution(values, span) / 2
     third = differences(values, 3)
     if len(values) < LEAST_SAMPLES or (scatter := _scatter(third)) == 0:
         return rounding
+    # Of hundreds of quick cycles the noise is no more than what the differences between two turning points show, nor
+    # than what cycles that repeat do from one to the next.
     turns = np.array(turning_points(values, DEEP_TURN * span))
     if len(turns) > MANY_TURNS and len(values) < LONG_BRANCH * (len(turns) - 1):
         near = turns[:, None] - np.arange(4)
@@ -142,10 +139,7 @@ class Line(NamedTuple):
 
 
 def steady_clock(time: np.ndarray) -> np.ndarray:
-    """A strictly increasing clock in units of the typical interval of times that never decrease, both of shape (n,).
-
-    Gaps are shortened and repeats spread, so that dwelling is judged by samples that are there.
-    """
+    """A strictly increasing clock in units of the typical interval: gaps are shortened and repeats spread."""
     steps = differences(time)
     if not (steps > 0).any():
         return np.arange(len(time), dtype=float)
@@ -154,11 +148,9 @@ def steady_clock(time: np.ndarray) -> np.ndarray:
 
 
 def turning_points(values: np.ndarray, depth: float) -> list[int]:
-    """Indices of the first sample, the turning points deeper than `depth`, and the last sample.
-
-    Of the local extremes, the pair with the smallest difference goes first, until every difference left is at
-    least `depth`; pairs that are smaller than both their neighbours go together.
-    """
+    """Indices of the first sample, the turning points deeper than `depth`, and the last sample."""
+    # Of the local extremes, the pair with the smallest difference goes first, until every difference left is at least
+    # `depth`; pairs that are smaller than both their neighbours go together.
     last = len(values) - 1
     steps = differences(values)
     moving = np.flatnonzero(steps)

@@ -1,8 +1,7 @@
-"""Text tables: cells, numbers, and errors that name the row as an editor counts it.
+"""Text tables with commas, semicolons or tabs: columns with units, cells, numbers, and errors that name the row.
 
-Columns are separated by commas or, as spreadsheets of many countries write, by semicolons or tabs. Numbers may have a
-decimal comma, between quotes where commas separate the columns, as long as it cannot be a thousands separator. A
-delimiter after the last cell of a row, and rows of delimiters only, hold nothing.
+Numbers may have a decimal comma, between quotes where commas separate the columns, as long as it cannot be a thousands
+separator. A delimiter after the last cell of a row, and rows of delimiters only, hold nothing.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,11 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
-from .._format import counted
+from .._format import counted, first_few
 from ..files import TABLE_BYTES, read_regular
-from .columns import LARGEST_MAGNITUDE
 
+# A larger magnitude (in mN, um or s) is a wrong unit or a damaged cell, and its powers would overflow further on.
+LARGEST_MAGNITUDE = 1e15
 SPACES = " \u00a0\u2007\u2009\u202f"
 """Blank, no-break, figure, thin and narrow no-break space: nobody sees which of them separates the thousands."""
 APOSTROPHES = "'\u2019"
@@ -85,40 +87,23 @@ def same_text(text: str) -> str:
 
 # ---- numbers ---------------------------------------------------------------------------------------------------------
 
-_LARGEST_NUMBER = LARGEST_MAGNITUDE * 1e12
-"""In any unit."""
+_LARGEST_NUMBER = LARGEST_MAGNITUDE * 1e12  # in any unit
 
 
-class NotANumber(ValueError):
-    """A cell, `index` of its column, that holds no number."""
-
-    def __init__(self, problem: str, index: int) -> None:
-        super().__init__(problem)
-        self.index = index
-
-
-def numbers(cells: Sequence[str], decimal_mark: str = ".") -> np.ndarray:
-    """The numbers of a column's cells, shape (n,); `NotANumber` at the first cell that `parse_number` refuses."""
+def plain_numbers(cells: Sequence[str], decimal_mark: str) -> np.ndarray | None:
+    """The numbers of a column's cells, several times as fast as by `parse_number`; None if some cell is not plain."""
     text = "\n".join(cells)
     if text.isascii() and "_" not in text and (decimal_mark == "." or "." not in text):
-        with contextlib.suppress(ValueError):  # several times as fast where all cells are plain
+        with contextlib.suppress(ValueError):
             values = np.array([float(cell.replace(decimal_mark, ".")) for cell in cells])
             if (np.abs(values) <= _LARGEST_NUMBER).all():
                 return values
-    found = []
-    for i, cell in enumerate(cells):
-        try:
-            found.append(parse_number(cell, decimal_mark))
-        except ValueError as error:
-            raise NotANumber(str(error), i) from None
-    return np.array(found)
+    return None
 
 
 def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> float:
-    """A cell's number; `thousands` are characters each of which may separate groups of three digits.
-
-    Raises `ValueError` if the cell is empty, text, not finite, or too large; the text says which.
-    """
+    """A cell's number, or a `ValueError` that says why there is none; each of the characters `thousands` may separate
+    groups of three digits."""
     text = cell.strip()
     if not text:
         raise ValueError("the cell is empty")
@@ -139,7 +124,7 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
         if thousands_mark(text, decimal_mark) and (not hint or "." in text):
             hint = " (a mark between the thousands?)"
         raise ValueError(f"{shown} is not a number{hint}")
-    if math.isnan(number) or (math.isinf(number) and "n" in plain.lower()):
+    if not math.isfinite(number):
         raise ValueError(f"{shown} is not a finite number")
     if abs(number) > _LARGEST_NUMBER:
         raise ValueError(f"{shown} is too large to be a measurement")
@@ -164,28 +149,18 @@ def thousands_mark(cell: str, decimal_mark: str = ".") -> str | None:
 
 
 def thousands_for_decimals(cells: Sequence[str], mark: str) -> tuple[int, str] | None:
-    """The index of a cell whose decimal mark may be one between thousands, and what is wrong with it.
-
-    So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
-    every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
-    number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
-    """
-    grouped: int | None = None
-    whole: str | None = None
-    for i, text in enumerate(cells):
-        cell = text.strip()
-        if mark in cell:
-            if _one_group(mark).fullmatch(cell) is None:
-                return None
-            grouped = i if grouped is None else grouped
-        elif whole is None and re.fullmatch(r"[-+]?[1-9][0-9]{2,}", cell):
-            whole = cell
-    if grouped is None or whole is None:
+    """The index of a cell whose decimal mark may be one between thousands, and what is wrong with it."""
+    # So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
+    # every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
+    # number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
+    marked = [i for i, cell in enumerate(cells) if mark in cell]
+    if not marked or not all(_one_group(mark).fullmatch(cells[i].strip()) for i in marked):
         return None
-    return (
-        grouped,
-        f"{cells[grouped].strip()!r} next to {whole!r} looks like a mark between thousands, not a decimal mark",
-    )
+    whole = next((cell.strip() for cell in cells if re.fullmatch(r"[-+]?[1-9][0-9]{2,}", cell.strip())), None)
+    if whole is None:
+        return None
+    alike = f"{cells[marked[0]].strip()!r} next to {whole!r}"
+    return marked[0], f"{alike} looks like a mark between thousands, not a decimal mark"
 
 
 # ---- tables ----------------------------------------------------------------------------------------------------------
@@ -207,12 +182,10 @@ class Table:
         return InputError(problem, file=self.file, row=row, column=self.header[column], remedy=remedy)
 
     def decimal_mark(self, columns: Sequence[int]) -> str:
-        """The decimal mark of some columns: a comma if one appears in them and is no thousands separator.
-
-        Spreadsheets separate columns by semicolons where the comma is the decimal mark. With tabs, or commas and
-        quotes, 1,500 is either: then a comma counts if there is no point in the columns and some cell, such as 1,5, has
-        other than three digits behind it.
-        """
+        """The decimal mark of some columns: a comma if one appears in them and is no thousands separator."""
+        # Spreadsheets separate columns by semicolons where the comma is the decimal mark. With tabs, or commas and
+        # quotes, 1,500 is either: then a comma counts if there is no point in the columns and some cell, such as 1,5,
+        # has other than three digits behind it.
         texts = ["\n".join(self.columns[i]) for i in columns]
         if not any("," in text for text in texts):
             return "."
@@ -240,17 +213,20 @@ class Table:
         if all(isinstance(self.columns[i], np.ndarray) for i in columns):
             return [self.columns[i] for i in columns]  # type: ignore[misc]
         mark = self.decimal_mark(columns) if mark is None else mark
-        return [self._numbers(i, mark, remedy) for i in columns]
-
-    def _numbers(self, column: int, mark: str, remedy: str | None) -> np.ndarray:
-        try:
-            return numbers(self.columns[column], mark)  # type: ignore[arg-type]
-        except NotANumber as error:
-            point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
-            if thousands_mark(self.columns[column][error.index], mark):
-                point += " and no mark between the thousands"
-            remedy = remedy or f"Write a number with {point}, or remove the row"
-            raise self.wrong(str(error), error.index, column, remedy) from None
+        point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
+        found = []
+        for i in columns:
+            values = plain_numbers(self.columns[i], mark)  # type: ignore[arg-type]
+            if values is None:
+                values = np.empty(len(self.rows))
+                for record, cell in enumerate(self.columns[i]):
+                    try:
+                        values[record] = parse_number(cell, mark)  # type: ignore[arg-type]
+                    except ValueError as error:
+                        remedy = remedy or f"Write a number with {point}, or remove the row"
+                        raise self.wrong(str(error), record, i, remedy) from None
+            found.append(values)
+        return found
 
 
 def filled(cells: Sequence[str]) -> int:
@@ -261,8 +237,8 @@ def filled(cells: Sequence[str]) -> int:
 def make_table(records: Sequence[list[str]], rows: Sequence[int], file: Path, delimiter: str = ",") -> Table:
     """A table from the cells of its records, the header first, and the row in which each begins.
 
-    Records whose cells are all empty are skipped; empty cells behind the last column that has a name are dropped.
-    Raises `InputError` if a record has another number of cells than the header, or there is none below it.
+    Empty records are skipped, and empty cells behind the last column that has a name dropped. Raises `InputError` if a
+    record has another number of cells than the header, or there is none below it.
     """
     full = [i for i, cells in enumerate(records) if (cells and cells[0].strip()) or filled(cells)]
     if not full:
@@ -274,7 +250,7 @@ def make_table(records: Sequence[list[str]], rows: Sequence[int], file: Path, de
     if not body:
         raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
     if {*map(len, body)} != {len(header)}:
-        body = [_fit(cells, row, names, file, delimiter) for cells, row in zip(body, rows, strict=True)]
+        body = [_fit(cells, row, names, file) for cells, row in zip(body, rows, strict=True)]
     return Table(file, header, list(zip(*body, strict=True)), rows, delimiter)
 
 
@@ -287,9 +263,6 @@ def check_header(header: Sequence[str], file: Path, row: int | None, remedy: str
 
 def _header(cells: list[str], file: Path) -> tuple[str, ...]:
     """Names of the columns, without blanks around them; none may be empty or appear twice."""
-    if len(cells) == 1 and "|" in cells[0]:
-        problem = "the columns are separated by '|'"
-        raise InputError(problem, file=file, row=1, remedy="Use commas, semicolons or tabs instead")
     header = tuple(cell.strip().strip("\ufeff").strip() for cell in cells)
     for i, name in enumerate(header):
         if not name:
@@ -298,15 +271,12 @@ def _header(cells: list[str], file: Path) -> tuple[str, ...]:
     return header
 
 
-def _fit(cells: list[str], row: int, names: list[str], file: Path, delimiter: str) -> list[str]:
+def _fit(cells: list[str], row: int, names: list[str], file: Path) -> list[str]:
     """The cells of a row below the names of the header; an error if there are more or fewer of them."""
     width, count = filled(names), filled(cells)
     if len(cells) >= width >= count:
         return cells[:width]
-    if len(names) >= len(cells) > width:
-        raise InputError(f"the name of column {width + 1} is empty", file=file, row=1, remedy="Name or delete it")
-    what = {",": "commas", ";": "semicolons", "\t": "tabs"}[delimiter]
-    column, remedy = None, f"{'Use decimal points and quote' if delimiter == ',' else 'Quote'} text that holds {what}"
+    column, remedy = None, "Use decimal points, and quote text that holds what separates the columns"
     if len(cells) < width:
         count, column, remedy = len(cells), names[len(cells)].strip(), "Fill the cell"
     problem = f"{counted(count, 'cell')} where the header has {width}"
@@ -314,10 +284,7 @@ def _fit(cells: list[str], row: int, names: list[str], file: Path, delimiter: st
 
 
 def split(text: str, file: Path, delimiter: str) -> tuple[list[list[str]], Sequence[int]]:
-    """The cells of every record of a text, and the line in which each begins.
-
-    Quoted cells may hold delimiters and line breaks. Raises `InputError` where quotes do not close.
-    """
+    """The cells of every record of a text, and the line in which each begins; an error where quotes do not close."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=delimiter)
     records: list[list[str]] = []
     lines = [1]  # in which each record begins, and the next one
@@ -331,7 +298,6 @@ def split(text: str, file: Path, delimiter: str) -> tuple[list[list[str]], Seque
     return records, lines[:-1]
 
 
-_SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*(?:\r\n|\r|\n)', re.IGNORECASE)
 _FIRST_LINE = re.compile(r"\s*[^\r\n]*")
 
 
@@ -365,11 +331,90 @@ def plain_table(text: str, file: Path, names: str) -> Table | None:
 
 
 def parse_table(text: str, file: Path) -> Table:
-    """A whole table of text; its delimiter is the commonest in the header, or the one that its first line names."""
-    named = _SEPARATOR.match(text)  # a line by which a spreadsheet program learns the delimiter
-    # Else the commonest of those that separate columns, outside of quotes, in the first line that is not blank.
+    """A whole table of text; its delimiter is the commonest, outside of quotes, in the first line that is not blank."""
     header = re.sub('"[^"]*"', "", _FIRST_LINE.match(text)[0])  # type: ignore[index]  # it matches every text
-    delimiter = named[1] if named is not None else max(",;\t", key=header.count)
-    records, rows = split(text, file, delimiter)
-    skipped = 0 if named is None else 1
-    return make_table(records[skipped:], rows[skipped:], file, delimiter)
+    delimiter = max(",;\t", key=header.count)
+    return make_table(*split(text, file, delimiter), file, delimiter)
+
+
+# ---- columns whose names carry their unit: `force_mN`, `displacement_um`, `time_s`, `D1_um` --------------------------
+
+DIMENSIONS = {"time": "time", "force": "force", "displacement": "length"}
+CANONICAL = {"force": "mN", "length": "um", "time": "s"}
+EXAMPLES = {"force": "mN, N, uN, kN, gf", "length": "um, nm, mm, m", "time": "s, ms, min"}
+_UNIT = re.compile(r"[A-Za-zµμ]{1,24}")
+
+
+@cache
+def _registry() -> Any:
+    from pint import UnitRegistry  # slow to import, and needed for other than the usual units only
+
+    # Fractions keep nm -> um at exactly 1/1000.
+    registry: Any = UnitRegistry
+    return registry(non_int_type=Fraction)
+
+
+@cache
+def unit_factor(unit: str, dimension: str) -> Fraction:
+    """How many canonical units (mN, um, s) one `unit` is; `ValueError` if it is unknown or measures something else."""
+    canonical = CANONICAL[dimension]
+    if unit == canonical:
+        return Fraction(1)
+    if not unit:
+        raise ValueError("the unit is missing")
+    if _UNIT.fullmatch(unit) is None:
+        raise ValueError(f"{unit!r} is not a unit")
+    try:
+        quantity = _registry().Quantity(Fraction(1), unit)
+    # Pint reports an unknown name through many exception types, some of them from Python's tokenizer.
+    except Exception:
+        raise ValueError(f"the unit {unit!r} is unknown") from None
+    if not quantity.is_compatible_with(canonical):
+        raise ValueError(f"{unit!r} is no unit of {dimension}")
+    return Fraction(quantity.to(canonical).magnitude)
+
+
+def convert(values: np.ndarray, factor: Fraction) -> np.ndarray:
+    """`values * factor`, rounded once where the factor is a whole number or the inverse of one."""
+    if factor == 1:
+        return values
+    with np.errstate(over="ignore"):  # the caller checks the size and names the row
+        return values / float(factor.denominator) if factor.numerator == 1 else values * float(factor)
+
+
+def find_column(
+    header: Sequence[str], quantity: str, dimension: str, file: str | Path, *, what: str = "column"
+) -> tuple[int, Fraction]:
+    """Where a name such as "force", without its unit, is in a header, and what turns the unit into the canonical one.
+
+    Raises `InputError`, in which the names are called `what`, if there is none, or two, or no unit or a wrong one.
+    """
+    expected = f"{quantity}_{CANONICAL[dimension]}"
+    units = f"units, as a suffix: {EXAMPLES[dimension]} (for example {expected})"
+    found = [i for i, name in enumerate(header) if name.rpartition("_")[0] == quantity]
+    if len(found) == 1:
+        named = header[found[0]]
+        try:
+            return found[0], unit_factor(named.rpartition("_")[2], dimension)
+        except ValueError as error:
+            problem, remedy = str(error), f"Accepted {units}"
+    elif found:
+        problem, named = f"{quantity} is given {len(found)} times", " and ".join(header[i] for i in found)
+        remedy = "Keep one of them"
+    elif quantity in header:
+        problem, named, remedy = "the unit is missing", quantity, f"Name it {expected}; accepted {units}"
+    else:
+        raise missing_column(header, expected, file, what=what, hint=f"; accepted {units}")
+    raise InputError(problem, file=file, row=1 if what == "column" else None, column=named, remedy=remedy)
+
+
+def missing_column(
+    header: Sequence[str], expected: str, file: str | Path, *, what: str = "column", hint: str = ""
+) -> InputError:
+    """The error for a column that is not there, with the nearest name that is."""
+    lower = {name.lower(): name for name in reversed(header)}
+    remedy = f"Add it; there are: {first_few(header, 12)}"
+    if close := get_close_matches(expected.lower(), list(lower), n=1):
+        remedy = f"Did you mean {expected!r} by {lower[close[0]]!r}? Rename it"
+    row = 1 if what == "column" else None
+    return InputError(f"the {what} {expected!r} is missing", file=file, row=row, remedy=remedy + hint)

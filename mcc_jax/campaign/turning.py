@@ -6,7 +6,7 @@ where the ramps before and behind it meet, or the mean of the hold between them.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,19 +31,12 @@ ROUNDED = 3.5
 
 
 class TurningForces(NamedTuple):
-    """The forces of a test as a law is to be compared with them; every array of shape (n,).
+    """The forces of a test as a law is to be compared with them; every array of shape (n,)."""
 
-    Attributes:
-        force: force [mN]: readings, and the estimate where many readings repeat one force (holds, turning points).
-        peak: force from which the branch of each point starts [mN]; on virgin loading its own force.
-        error: standard error of `peak` in standard errors of a reading; 0 on virgin loading.
-        reading: whether a point's force is a reading of its own.
-    """
-
-    force: np.ndarray
-    peak: np.ndarray
-    error: np.ndarray
-    reading: np.ndarray
+    force: np.ndarray  # [mN], readings, and the estimate where many repeat one force (holds, turning points)
+    peak: np.ndarray  # force from which the branch of each point starts [mN]; on virgin loading its own force
+    error: np.ndarray  # standard error of `peak` in standard errors of a reading; 0 on virgin loading
+    reading: np.ndarray  # whether a point's force is a reading of its own
 
     __repr__ = described()
 
@@ -111,7 +104,9 @@ def _level(
         if rising is None or _fitted(time, raw, behind, turn, noise) is None:
             return largest, 1.0
         level, variance = rising.at(0.0)
-        return (largest, 1.0) if abs(level - largest) > APART * noise else (level, min(variance**0.5, 1.0))
+        return (
+            (largest, 1.0) if abs(level - largest) > APART * noise else (float(level), min(float(variance) ** 0.5, 1.0))
+        )
     # The readings next to the turn may be on either side of it: first without them, then each where it belongs.
     rising, falling = _fitted(time, raw, before[:-1], turn, noise), _fitted(time, raw, behind[1:], turn, noise)
     if rising is None or falling is None:
@@ -143,7 +138,7 @@ def _level(
 def _meeting(rising: _Ramp, falling: _Ramp, step: float) -> float:
     """When the ramps before and behind a turning point come closest to each other, from the turning reading on."""
     instants = np.linspace(-step, step, 41)
-    return float(instants[int(np.argmin(np.abs(rising.along(instants) - falling.along(instants))))])
+    return float(instants[int(np.argmin(np.abs(rising.at(instants)[0] - falling.at(instants)[0])))])
 
 
 def _run(near: np.ndarray, start: int, stop: int, direction: int) -> np.ndarray:
@@ -172,14 +167,10 @@ class _Ramp(NamedTuple):
     covariance: np.ndarray
     unit: float
 
-    def at(self, time: float) -> tuple[float, float]:
-        """Force and variance."""
-        x = (time / self.unit) ** np.arange(len(self.values))
-        return float(x @ self.values), float(x @ self.covariance @ x)
-
-    def along(self, time: np.ndarray) -> np.ndarray:
-        """Force at several times."""
-        return (time[:, None] / self.unit) ** np.arange(len(self.values)) @ self.values
+    def at(self, time: Any) -> tuple[Any, Any]:
+        """Force and variance, at one time or several."""
+        x = (np.asarray(time)[..., None] / self.unit) ** np.arange(len(self.values))
+        return x @ self.values, np.sum(x @ self.covariance * x, axis=-1)
 
     def slope(self, time: float) -> float:
         k = np.arange(1, len(self.values))

@@ -1,13 +1,6 @@
 """What a test shows whatever its units, and which wrong units, times or swapped columns would explain it.
 
-Forces, displacements, diameters and times enter as logarithms, in which a wrong unit is a shift, so that all hypotheses
-together cost next to nothing.
-
-The ranges of solids: moduli and hardnesses are those of Ashby, "Materials selection in mechanical design", charts of
-modulus against density and against strength: polymers 0.1 to 10 GPa, ceramics and glasses 20 to 700 GPa, metals 10 to
-450 GPa; a hardness is about three times the strength. They are widened downwards by 2 to 4 for porous and granular
-bodies. Elastomers and gels are left out on purpose: the law describes solids that yield, and a stiff solid whose forces
-are 1000 times too small looks like rubber.
+Numbers enter as logarithms, in which a wrong unit is a shift, so that all hypotheses together cost next to nothing.
 """
 
 from __future__ import annotations
@@ -77,7 +70,8 @@ def curve_features(time: np.ndarray, force: np.ndarray, displacement: np.ndarray
         way = float(abs(depth[peak]) if begins_at_peak else depth[peak] - depth[contact])
         fullness = loading_s = loss = np.nan
         if not begins_at_peak and way > 0:
-            rows = contact + np.flatnonzero(_virgin(load[contact : peak + 1]))
+            climb = load[contact : peak + 1]
+            rows = contact + np.flatnonzero(climb >= np.maximum.accumulate(climb))
             fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
             first, last = (rows[np.argmax(load[rows] >= share * height)] for share in (0.1, 0.9))
             loading_s = float(time[last] - time[first])
@@ -113,15 +107,11 @@ def _contact(rise: np.ndarray) -> tuple[int, float]:
     return (int(below[-1]) if len(below) and below[-1] < len(rise) - 1 else 0), base
 
 
-def _virgin(load: np.ndarray) -> np.ndarray:
-    """Which samples have a load that was not reached before."""
-    return load >= np.maximum.accumulate(load)
-
-
 def _correlation(load: np.ndarray, depth: np.ndarray) -> float:
     """Of the samples whose load was not reached before (or is not again, where the record only unloads)."""
     if load[0] <= load[-1]:
-        load, depth = load[_virgin(load)], depth[_virgin(load)]
+        virgin = load >= np.maximum.accumulate(load)
+        load, depth = load[virgin], depth[virgin]
     if not (np.ptp(load) > 0 and np.ptp(depth) > 0):
         return 0.0
     a, b = (load - load.mean()) / np.ptp(load), (depth - depth.mean()) / np.ptp(depth)
@@ -146,14 +136,16 @@ class Properties(NamedTuple):
     """What the peak of a test shows of its material, as values (decades) or as ranges of one class of solids."""
 
     modulus_MPa: Any  # by the slope of unloading (Oliver and Pharr 1992, with the contact radius of a plastic sphere)
-    loading_modulus_MPa: Any
-    """Of the elastic sphere (Hertz) that the same force would compress as far; less than the modulus where the contact
-    yields, or where loose first contact adds to the displacement."""
+    loading_modulus_MPa: Any  # of the elastic sphere (Hertz) that the same force would compress as far
     stress_MPa: Any  # force / (pi R_e^2)
     strain: Any  # displacement / D_e
     pressure_MPa: Any  # mean in the contact, force / (pi R_e displacement); at most the hardness
 
 
+# Moduli and hardnesses from Ashby, "Materials selection in mechanical design", charts of modulus against density and
+# against strength (a hardness is about three times it), widened downwards by 2 to 4 for porous and granular bodies.
+# Elastomers and gels are left out: the law describes solids that yield, and a stiff solid whose forces are 1000 times
+# too small looks like rubber.
 SOLIDS = (
     # Soft. Below 0.2 MPa only surface irregularities deform (Bommireddy et al. 2018, section 3), so no test ends there.
     # Polymers yield at strains of 1 to 5 % (Ashby), and a test that shows plasticity goes beyond 3 %.

@@ -35,15 +35,11 @@ def read_sheet(
     decimal_mark: str = ".",
     how: str = "",
 ) -> list[list[str]]:
-    """The cells of all rows of a sheet as text, numbers with all their digits.
+    """The cells of all rows of a sheet as text, numbers with all their digits and this decimal mark.
 
-    Raises `InputError` if it is damaged or too large, the sheet is not clear, or calamine is not installed.
-
-    Args:
-        sheet: the sheet's name, or its number, 1 for the first; None for the only one that holds anything.
-        preferred: the name of the sheet to take, if there is one, where `sheet` is None.
-        decimal_mark: how numbers are written; "." or ",".
-        how: how a sheet is chosen, for the message where there are several; one sentence.
+    The sheet has this name or number, 1 for the first; without one it is the `preferred` one, or the only one that
+    holds anything. Raises `InputError` if the workbook is damaged or too large, or the sheet is not clear; `how` is how
+    to choose one.
     """
     import pandas as pd
 

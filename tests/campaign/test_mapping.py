@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers import INSTRUMENTS, refusal
+from test_readers import lines_of
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import read_instrument_file
@@ -29,19 +31,7 @@ def convert(tmp_path, table: str | bytes = TABLE, mapping: str = MAPPING, **kwar
 
 
 def message(*args, **kwargs) -> str:
-    with pytest.raises(InputError) as caught:
-        convert(*args, **kwargs)
-    assert str(caught.value).isprintable()
-    return str(caught.value)
-
-
-def test_plain(tmp_path):
-    campaign = convert(tmp_path)
-    assert campaign.particles == ("t",)
-    assert campaign.diameters_um.tolist() == [[200, 190, 180]]
-    assert campaign.curves[0].force_mN.tolist() == [0, 1, 2]
-    assert campaign.curves[0].displacement_um.tolist() == [0, 0.5, 1]
-    assert "t.dat, mapped by m.toml" in (campaign.metadata.provenance or "")
+    return refusal(convert, *args, **kwargs)
 
 
 def test_everything_unusual_at_once(tmp_path):
@@ -101,9 +91,6 @@ def test_encodings(tmp_path, encoding):
 
 
 def test_fischer_through_a_mapping_equals_its_reader(tmp_path):
-    from helpers import INSTRUMENTS
-    from test_readers import lines_of
-
     rows = "\n".join(lines_of("FS1.txt")[84:1285])
     mapping = """
 encoding = "latin-1"
@@ -131,7 +118,7 @@ def without(table: str) -> str:
 
 BAD_MAPPING = {
     "not TOML": ("x", ["row 1", "not TOML"]),
-    "empty": (" ", ["empty"]),
+    "empty": (" ", ["'columns'", "is missing"]),
     "unknown key": ('delimeter = ","\n' + MAPPING, ["'delimeter'", "Did you mean 'delimiter'?"]),
     "unknown key of columns": (
         MAPPING + "[columns.particle]\ncolumn = 4\n",
@@ -140,30 +127,19 @@ BAD_MAPPING = {
     "no columns": ("skip_rows = 1", ["'columns'", "is missing", "[columns.force]"]),
     "no time": (without("columns.time"), ["'columns.time': is missing"]),
     "no unit": (MAPPING.replace('unit = "N"', ""), ["'columns.force.unit'", "missing", "mN"]),
-    "unit no text": (MAPPING.replace('unit = "N"', "unit = 3"), ["'columns.force.unit'", "`str`"]),
     "unknown unit": (MAPPING.replace('"N"', '"bananas"'), ["'columns.force.unit'", "unknown"]),
     "sign": (MAPPING.replace('"N"', '"N"\nsign = 2'), ["'columns.force.sign'", "1 or -1"]),
     "column zero": (MAPPING.replace('"Load"', "0"), ["'columns.force.column'"]),
-    "column no name": (MAPPING.replace('"Load"', "1.5"), ["'columns.force.column'"]),
     "name without header": ("header_rows = 0\n" + MAPPING, ["'columns.time.column'", "header_rows"]),
     "test column missing": ('tests = "column"\n' + MAPPING, ["'columns.test'", "needed"]),
     "tests unknown": ('tests = "row"\n' + MAPPING, ["'tests'", '"blank line"']),
-    "rows negative": ("skip_rows = -1\n" + MAPPING, ["'skip_rows'", ">= 0"]),
-    "encoding unknown": ('encoding = "klingon"\n' + MAPPING, ["'encoding'", "'klingon'"]),
     "delimiter long": ('delimiter = "ab"\n' + MAPPING, ["'delimiter'", '"semicolon"']),
-    "decimal mark": ('decimal_mark = ";"\n' + MAPPING, ["'decimal_mark'"]),
     "thousands unknown": ('thousands = "dot"\n' + MAPPING, ["'thousands'", '"apostrophe"']),
     "thousands and decimals": ('thousands = "point"\n' + MAPPING, ["'thousands'", "also the decimal mark"]),
     "thousands and delimiter": ('delimiter = "space"\nthousands = "space"\n' + MAPPING, ["'thousands'", "delimiter"]),
-    "missing no list": ('missing = "NaN"\n' + MAPPING, ["'missing'", "a list"]),
     "begin and rows": ('begin = "T"\nskip_rows = 1\n' + MAPPING, ["'begin'", "Keep one"]),
     "header again, but none": ('tests = "header"\nheader_rows = 0\n' + MAPPING, ["'tests'", "header_rows"]),
-    "sheet zero": ("sheet = 0\n" + MAPPING, ["'sheet'", "from 1"]),
     "speed of what": (MAPPING.replace('column = "Time (s)"', "speed = 1"), ["'columns.time.unit'", "mm/s"]),
-    "speed zero": (
-        MAPPING.replace('column = "Time (s)"\nunit = "s"', 'speed = 0\nunit = "mm/s"'),
-        ["'columns.time.speed'", ">= 1e-15"],
-    ),
     "interval in mm": (
         MAPPING.replace('column = "Time (s)"\nunit = "s"', 'interval = 1\nunit = "mm"'),
         ["no unit of time"],
@@ -171,12 +147,11 @@ BAD_MAPPING = {
     "both diameters": (MAPPING + '[diameters]\nheader = "D"\n', ["'diameters'", "Keep one"]),
     "diameters of no row": (without("diameters_um") + "\n[diameters]\n", ["'diameters.header'", "Gage length"]),
     "unit of diameters": (without("diameters_um") + '\n[diameters]\nheader = "D"\nunit = "N"', ["'diameters.unit'"]),
-    "control": ('control = "force"\n' + MAPPING, ["'control'", '"displacement"']),
     "name for many": ('tests = "blank line"\ntest_name = "A"\n' + MAPPING, ["'test_name'", "Remove"]),
     "diameters no table": ("diameters_um = 3\n" + without("diameters_um"), ["'diameters_um'", "all = "]),
     "diameters text": (MAPPING.replace("180", '"180"'), ["'diameters_um'", "three numbers"]),
     "diameters huge": (MAPPING.replace("180", "1" + "0" * 400), ["'all'", "64 bits"]),
-    "diameters zero": (MAPPING.replace("180", "0"), ["three positive lengths"]),
+    "diameters zero": (MAPPING.replace("180", "0"), ["three positive"]),
 }
 
 
@@ -192,7 +167,6 @@ def test_bad_mapping(tmp_path, case):
 BAD_TABLE = {
     "no such column": (TABLE.replace("Load", "Laod"), "", ["row 1", "no column 'Load'", "Did you mean 'Laod'"]),
     "column twice": (TABLE.replace("Depth", "Load"), "", ["row 1", "2 columns called 'Load'", "number"]),
-    "empty cell": (TABLE.replace("0.001", ""), "", ["row 3", "'Load'", "empty"]),
     "overflow in its unit": (TABLE.replace("0.001", "1e14"), "", ["row 3", "'Load'", "too large"]),
     "cells too few": (TABLE.replace(",500", ""), "", ["row 3", "2 cells where 3"]),
     "time goes back": (TABLE + "1.5,1,1\n", "", ["row 5", "goes back"]),
@@ -200,10 +174,8 @@ BAD_TABLE = {
     "no rows": (TABLE, "skip_rows = 50\n", ["no column"]),
     "header only": ("Time (s),Load,Depth\n", "", ["no rows of data", "m.toml"]),
     "encoding": (TABLE.replace("Load", "L\xf6ad").encode("latin-1"), "", ["cannot be decoded as 'utf-8'"]),
-    "gzip": (b"\x1f\x8b\x08", "", ["gzip"]),
+    "encoding unknown": (TABLE, 'encoding = "klingon"\n', ["cannot be decoded as 'klingon'"]),
     "empty": ("", "", ["empty"]),
-    "one row": ("Time (s),Load,Depth\n0,1,1\n", "", ["row 2", "one row only"]),
-    "all zero": ("Time (s),Load,Depth\n0,0,1\n1,0,2\n", "", ["every force", "no data"]),
 }
 
 

@@ -92,13 +92,6 @@ def test_the_zero_of_force_in_the_air_is_taken_off_with_its_error(seed, offset_m
     assert all("before contact; this was taken off" in one.sentence for one in found)
 
 
-def test_an_offset_is_reported_with_its_size():
-    _, found = only(faulty.in_air(noisy(exact(), 0), offset_mN=20.0), "zero of force")
-    assert (found.level, found.particles) == ("info", exact().particles)
-    assert "before contact; this was taken off" in found.sentence
-    assert "20" in found.sentence
-
-
 def test_an_offset_that_no_answer_can_feel_is_taken_off_without_a_word():
     checked = check_tests(faulty.in_air(noisy(exact(), 0), offset_mN=0.1))
     assert campaign_findings(checked) == ()

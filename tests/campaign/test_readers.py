@@ -1,19 +1,18 @@
 from __future__ import annotations
 
 import io
-import re
 import struct
 import zipfile
 
 import numpy as np
 import pytest
-from helpers import INSTRUMENTS
+from helpers import INSTRUMENTS, refusal
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import read_campaign, read_diameters, read_instrument_file, write_campaign
 from mcc_jax.campaign.readers import micromaterials
 
-FILES = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
+FILES = FS, HLD, LC, ZIP = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
 SIZES = [200.0, 190.0, 180.0]
 
 
@@ -22,16 +21,11 @@ def read(path, **kwargs):
 
 
 def message(path, **kwargs) -> str:
-    with pytest.raises(InputError) as caught:
-        read(path, **kwargs)
-    text = str(caught.value)
-    assert text.isprintable()
-    assert ". " in text or "? " in text
-    return text
+    return refusal(read, path, **kwargs)
 
 
 def test_fischer():
-    campaign = read(INSTRUMENTS / "FS1.txt")
+    campaign = read(INSTRUMENTS / FS)
     assert campaign.particles == tuple(str(i) for i in range(1, 11))
     assert campaign.diameters_um.shape == (10, 3)
     assert campaign.metadata.control == "load"
@@ -47,7 +41,7 @@ def test_fischer():
 
 
 def test_hysitron_hld():
-    campaign = read(INSTRUMENTS / "Exp-50mN_0000.hld")
+    campaign = read(INSTRUMENTS / HLD)
     assert campaign.particles == ("Exp-50mN_0000",)
     curve, other = campaign.curves[0], campaign.metadata.other
     assert len(curve) == 1068
@@ -65,7 +59,7 @@ def test_hysitron_hld():
 
 
 def test_hysitron_lc():
-    campaign = read(INSTRUMENTS / "RobinSteel0000LC.txt")
+    campaign = read(INSTRUMENTS / LC)
     curve, other = campaign.curves[0], campaign.metadata.other
     assert len(curve) == 5304
     assert other["block_lengths"] == [201, 104, 2000, 1000, 1999]
@@ -75,7 +69,7 @@ def test_hysitron_lc():
 
 
 def test_micromaterials():
-    campaign = read(INSTRUMENTS / "multipleIndentations.zip")
+    campaign = read(INSTRUMENTS / ZIP)
     assert len(campaign) == 39
     assert campaign.particles[0] == "1000nmXX 1 6958 -4555"
     assert campaign.metadata.control is None
@@ -104,7 +98,7 @@ def test_diameters(tmp_path):
     table = tmp_path / "d.csv"
     table.write_text("particle,D1_mm,D2_um,D3_um\nRobinSteel0000LC,0.2,190,180\n")
     diameters = read_diameters(table)
-    campaign = read(INSTRUMENTS / "RobinSteel0000LC.txt", diameters_um=diameters)
+    campaign = read(INSTRUMENTS / LC, diameters_um=diameters)
     assert campaign.diameters_um.tolist() == [SIZES]
     assert read_diameters("200,190, 180") == SIZES
 
@@ -113,33 +107,16 @@ def test_diameters(tmp_path):
     ("diameters", "piece"),
     [
         (None, "--diameters"),
-        ([1.0, 2.0], "three positive lengths"),
-        ([1.0, 2.0, -3.0], "three positive lengths"),
-        ([1.0, 2.0, float("nan")], "three positive lengths"),
+        ([1.0, 2.0], "three positive"),
+        ([1.0, 2.0, -3.0], "three positive"),
+        ([1.0, 2.0, float("nan")], "three positive"),
         ({}, "--diameters"),
-        ({"x": SIZES}, "none of the diameters is for a test"),
-        ({"RobinSteel0000LC": [1.0]}, "three positive lengths"),
+        ({"x": SIZES}, "no diameters for 1 of 1 tests"),
+        ({"RobinSteel0000LC": [1.0]}, "three positive"),
     ],
 )
 def test_bad_diameters(diameters, piece):
-    assert piece in message(INSTRUMENTS / "RobinSteel0000LC.txt", diameters_um=diameters)
-
-
-@pytest.mark.parametrize(
-    ("text", "piece"),
-    [
-        ("particle,D1_um,D2_um,D3_um\nA,1,1,1\nA,1,1,1\n", "row 3, column 'particle': the particle 'A' is already"),
-        ("particle,D1_um,D2_um\nA,1,1\n", "'D3_um' is missing"),
-        ("name,D1_um,D2_um,D3_um\nA,1,1,1\n", "'particle' is missing"),
-        ("particle,D1_um,D2_um,D3_um\nA,1,0,1\n", "row 2, column 'D2_um'"),
-        ("particle,D1_um,D2_um,D3_um\nA,1,x,1\n", "row 2, column 'D2_um'"),
-        ("particle,D1_um,D2_um,D3_um\nA,1,1,1\n ,1,1,1\n", "row 3, column 'particle': the name is empty"),
-    ],
-)
-def test_bad_table_of_diameters(tmp_path, text, piece):
-    (tmp_path / "d.csv").write_text(text)
-    with pytest.raises(InputError, match=re.escape(piece)):
-        read_diameters(tmp_path / "d.csv")
+    assert piece in message(INSTRUMENTS / LC, diameters_um=diameters)
 
 
 @pytest.mark.parametrize("text", ["1,2,x", "1,2,-3", "1,2,nan", "1,2", "nowhere.csv", ""])
@@ -154,31 +131,19 @@ def lines_of(name: str) -> list[str]:
 
 DAMAGE = {
     # name of the file, what is done to its lines, what the message holds
-    "fs cut between tests": ("FS1.txt", lambda x: x[:7415], ["announces 10 tests, the file holds 6"]),
-    "fs cut in a test": ("FS1.txt", lambda x: x[:12000], ["'10'", "before its greatest force", "export it again"]),
-    "fs cut in a row": ("FS1.txt", lambda x: [*x[:500], "1,5\t0,2"], ["row 501", "2 cells where 3"]),
-    "fs time": ("FS1.txt", lambda x: [*x[:99], "1,5\t0,2\t0,1", *x[100:]], ["row 100", "goes back"]),
-    "fs no samples": ("FS1.txt", lambda x: x[:11110], ["'10' has no samples"]),
-    "hld cut": ("Exp-50mN_0000.hld", lambda x: x[:2000], ["row 1422", "Test announces 1068 rows"]),
-    "hld no test": ("Exp-50mN_0000.hld", lambda x: x[:1421], ["'Test Data Points' is missing"]),
-    "hld text": (
-        "Exp-50mN_0000.hld",
-        lambda x: [*x[:1500], x[1500].replace("\t", "\tx", 1), *x[1501:]],
-        ["row 1501", "'Disp_nm'", "is not a number"],
-    ),
-    "hld row short": ("Exp-50mN_0000.hld", lambda x: [*x[:1500], "1\t2", *x[1501:]], ["row 1501", "2 cells where 8"]),
-    "hld column": (
-        "Exp-50mN_0000.hld",
-        lambda x: [s.replace("Disp_nm\tForce", "Disp\tForce") for s in x],
-        ["'Disp_nm'"],
-    ),
-    "lc cut": ("RobinSteel0000LC.txt", lambda x: x[:3000], ["row 3", "5304 points are announced"]),
-    "lc text": ("RobinSteel0000LC.txt", lambda x: [*x[:99], "x" + x[99], *x[100:]], ["row 100", "'Depth (nm)'", "x"]),
-    "lc column": (
-        "RobinSteel0000LC.txt",
-        lambda x: [s.replace("Time (s)", "Zeit") for s in x],
-        ["row 4", "'Time (s)'"],
-    ),
+    "fs cut between tests": (FS, lambda x: x[:7415], ["announces 10 tests, the file holds 6"]),
+    "fs cut in a test": (FS, lambda x: x[:12000], ["'10'", "before its greatest force", "export it again"]),
+    "fs cut in a row": (FS, lambda x: [*x[:500], "1,5\t0,2"], ["row 501", "2 cells where 3"]),
+    "fs time": (FS, lambda x: [*x[:99], "1,5\t0,2\t0,1", *x[100:]], ["row 100", "goes back"]),
+    "fs no samples": (FS, lambda x: x[:11110], ["'10' has no samples"]),
+    "hld cut": (HLD, lambda x: x[:2000], ["row 1422", "Test announces 1068 rows"]),
+    "hld no test": (HLD, lambda x: x[:1421], ["'Test Data Points' is missing"]),
+    "hld text": (HLD, lambda x: [*x[:1500], x[1500].replace("\t", "\tx", 1), *x[1501:]], ["row 1501", "'Disp_nm'"]),
+    "hld row short": (HLD, lambda x: [*x[:1500], "1\t2", *x[1501:]], ["row 1501", "2 cells where 8"]),
+    "hld column": (HLD, lambda x: [s.replace("Disp_nm\tForce", "Disp\tForce") for s in x], ["'Disp_nm'"]),
+    "lc cut": (LC, lambda x: x[:3000], ["row 3", "5304 points are announced"]),
+    "lc text": (LC, lambda x: [*x[:99], "x" + x[99], *x[100:]], ["row 100", "'Depth (nm)'", "x"]),
+    "lc column": (LC, lambda x: [s.replace("Time (s)", "Zeit") for s in x], ["row 4", "'Time (s)'"]),
 }
 
 
@@ -255,11 +220,6 @@ def test_too_large_archive(tmp_path, monkeypatch):
         (b"", "empty"),
         (b"hello\nworld\n", "format is not known (known: Fischer HM export"),
         (b"time,force\n1,2\n", "--mapping"),
-        (b"1.0\t2.0\t3.0\n1.0\t2.0\t3.0\n", 'delimiter = "tab"; decimal_mark = "."; header_rows = 0'),
-        ("Gerät X\nZeit;Kraft;Weg\n0,1;2;3,5\n".encode("cp1252"), 'encoding = "cp1252"; delimiter = "semicolon"'),
-        (b"Tester X\nt;F;h\n0,1;2;3,5\n", 'decimal_mark = ","; begin = "t"'),
-        (b"t,F,h\ns,mN,um\n0.1,2,3.5\n", 'header_rows = 2; [columns] time = { column = "..."'),
-        (b"t,F,h\n0.1,2,3.5\n", 'its columns are "t", "F", "h"'),
         (b"\x1f\x8b\x08junk", "gzip"),
         (b"\x89HDF\r\n", "HDF5"),
         (b"abc\0def", "NUL"),

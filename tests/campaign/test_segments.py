@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from protocols import Protocol, make_protocol
 
-from mcc_jax.campaign import Curve, Segment, find_segments, read_instrument_file, summarise_segments
+from mcc_jax.campaign import Curve, Segment, find_segments, read_instrument_file
 
 
 def read(name: str):
@@ -166,12 +166,6 @@ def test_reload_is_cut_where_virgin_loading_begins():
     segments = find_segments(curve)
     assert kinds(segments) == ["load", "unload", "reload", "load", "unload"]
     assert force[segments[3].start] == pytest.approx(60, abs=1)
-    rows = summarise_segments(curve, segments)
-    assert [row["kind"] for row in rows] == kinds(segments)
-    assert rows[0]["force_from_mN"] == 0
-    assert rows[2]["force_from_mN"] == 20
-    assert rows[-1]["stop_s"] == len(force) - 1
-    assert sum(row["samples"] for row in rows) == len(force)
 
 
 def test_reload_to_the_same_peak_stays_reload():

@@ -84,7 +84,7 @@ def test_bad_programme(run, tmp_path, kind):
 COMMAND_LINES = {
     "calibrate {n} --out {o}": "no such folder",
     "calibrate {f} --out {o}": "not a campaign folder",
-    "calibrate {c}/curves.csv --out {o}": "Did you mean the folder it lies in",
+    "calibrate {c}/curves.csv --out {o}": "is a file, not a campaign folder",
     "calibrate {o} --out {o}": "particles.csv is missing",
     "calibrate {c} --out {f}": "is a file, not a folder",
     "calibrate {c} --out {f}/below/it --no-figures": "cannot be written",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, signature_rows
 
 from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, paper_campaign
-from mcc_jax.campaign import available_data, find_segments, humidities, record_batch, record_of
+from mcc_jax.campaign import available_data, find_segments, humidities, record_of
 from mcc_jax.campaign.record import ramp_rates
 from mcc_jax.effects import Need, clean_record
 
@@ -107,24 +107,11 @@ def test_noise_of_force_does_not_change_what_an_effect_adds():
 
 
 @pytest.mark.extended
-def test_batch_pads_with_the_last_point():
-    tests = campaign(points=120)
-    batch = record_batch(tests, multiple=16)
-    lengths = [len(c) for c in tests.curves]
-    assert batch.force.shape[1] % 16 == 0
-    for i, n in enumerate(lengths):
-        np.testing.assert_array_equal(batch.force[i, :n], tests.curves[i].force_mN)
-        for leaf in (batch.force, batch.time, batch.kind, batch.reloads, batch.loading_rate):
-            assert (np.asarray(leaf[i, n:]) == np.asarray(leaf[i, n - 1])).all()
-    assert batch.relative_humidity.shape == (20,)
-
-
-@pytest.mark.extended
 def test_humidity_comes_from_its_column():
     tests = campaign(points=60)
     assert humidities(tests) is None
     wet = dataclasses.replace(tests, columns={"relative_humidity_percent": tuple(str(30 + i) for i in range(20))})
-    np.testing.assert_array_equal(record_batch(wet).relative_humidity, 30 + np.arange(20))
+    np.testing.assert_array_equal(humidities(wet), 30 + np.arange(20))
     assert Need.HUMIDITY_COLUMN in available_data(wet)
     for text in ("x", "-1", "101", "nan"):
         bad = dataclasses.replace(tests, columns={"relative_humidity_percent": (text,) * 20})

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -28,8 +27,6 @@ class Kind:
         suspect: an answer, if there is one, must come with a warning or as not converged.
         modulus: factor within which the modulus must be right; None if it need not be.
         says: what an error, or a particle's reason, must contain.
-        damage: what is done to the files after the campaign was written, for the command only; what the one line of the
-            error must then name is in `says`.
     """
 
     name: str
@@ -40,7 +37,6 @@ class Kind:
     suspect: bool = False
     modulus: float | None = None
     says: str = ""
-    damage: Callable[[np.random.Generator, Path], None] | None = None
 
 
 # ---- what the kinds are made of --------------------------------------------------------------------------------------
@@ -231,10 +227,7 @@ WHOLE = {
     "plain": (NEAR, plain),
     "500 cycles to rising levels": (ROUGHLY, lambda rng: cycles(rng, RISING, unload_to=0.1, points=6000)),
     "500 cycles to one level": (ROUGHLY, lambda rng: cycles(rng, np.ones(500), unload_to=0.1, points=30_000)),
-    "500 cycles to rising levels, two samples each": (
-        READS,
-        lambda rng: cycles(rng, np.linspace(0.05, 1, 500), unload_to=0.0),
-    ),
+    "500 cycles of two samples each": (READS, lambda rng: cycles(rng, np.linspace(0.05, 1, 500), unload_to=0.0)),
     "300 cycles to random levels": (ROUGHLY, lambda rng: cycles(rng, RANDOM, unload_to=0.1, points=9000)),
     "100 cycles, ten samples each": (
         ROUGHLY,
@@ -246,10 +239,7 @@ WHOLE = {
     "12 to 20 rows": (ANY, few_rows),
     "one particle": (ANY, lambda rng: plain(rng, count=1)),
     "two particles": (READS, lambda rng: plain(rng, count=2)),
-    "a hold at every level": (
-        ROUGHLY,
-        lambda rng: cycles(rng, (0.4, 0.7, 1.0), hold_s=30.0, unload_to=0.2, points=300),
-    ),
+    "holds": (ROUGHLY, lambda rng: cycles(rng, (0.4, 0.7, 1.0), hold_s=30.0, unload_to=0.2, points=300)),
     "displacement control": (ROUGHLY, lambda rng: cycles(rng, **CONTROLLED)),
     "tests under load and displacement mixed": (ROUGHLY, mixed_control),
     "partial unloading only": (READS, lambda rng: ramps(rng, 1.0, 0.6, points=POINTS)),
@@ -313,10 +303,7 @@ FORCES = {
     "one spike of force, -1e4 mN": (ANY, lambda f, rng: spiked(f, rng, -1e4)),
     "force stuck for a while": (ANY, stuck),
     "force saturated at 80 %": (ANY, lambda f, _: np.minimum(f, 0.8 * f.max())),
-    "particle breaks: the force is gone": (
-        ANY,
-        lambda f, _: np.where(np.arange(len(f)) >= int(0.35 * len(f)), 0.1 * f, f),
-    ),
+    "particle breaks": (ANY, lambda f, _: np.where(np.arange(len(f)) >= int(0.35 * len(f)), 0.1 * f, f)),
     "not a number in force": (REFUSED | {"says": "nan"}, instead(np.nan)),
     "all forces zero": (REFUSED | {"says": "zero"}, constant(0.0)),
     "force and displacement of unlike lengths": (REFUSED | {"says": "entries"}, lambda f, _: f[:-3]),
@@ -363,10 +350,7 @@ FIRST = {
     "one test of constant force": (READS, first_changed(force_mN=constant(50.0))),
     "one test of constant displacement": (READS, first_changed(displacement_um=constant(10.0))),
     "three particles of four unloading only": (UNLOADS, lambda c, _: first_of(c, rows(c, from_top))),
-    "one particle tested, all others below the threshold": (
-        ANY,
-        lambda c, rng: first_of(c, changed(c, rng, force_mN=times(1e-3))),
-    ),
+    "all but one below the threshold": (ANY, lambda c, rng: first_of(c, changed(c, rng, force_mN=times(1e-3)))),
 }
 """Plain campaigns whose first test is not like the others."""
 
@@ -391,59 +375,3 @@ KINDS = [
     *_kinds(FIRST, lambda c, rng, change: change(c, rng)),
 ]
 """The catalogue, in order."""
-
-
-# ---- files damaged after they were written ---------------------------------------------------------------------------
-
-
-def _with(lines: list[str], row: int, cell: int, text: str) -> list[str]:
-    cells = lines[row].split(",")
-    cells[cell] = text
-    return [*lines[:row], ",".join(cells), *lines[row + 1 :]]
-
-
-def _any(rng, lines: list[str], first: int = 1) -> int:
-    return int(rng.integers(first, len(lines)))
-
-
-def _cut_cell(rng, lines: list[str]) -> list[str]:
-    row = _any(rng, lines)
-    return [*lines[:row], lines[row].rsplit(",", 1)[0], *lines[row + 1 :]]
-
-
-def _cut_row(rng, lines: list[str]) -> list[str]:
-    row = _any(rng, lines, 20)
-    return [*lines[:row], lines[row][:8]]
-
-
-# Name, file, what the error must name, and what becomes of the lines.
-DAMAGES = [
-    ("a force that is text", "curves.csv", "row", lambda rng, x: _with(x, _any(rng, x), 2, "overload")),
-    ("a displacement of 1e300", "curves.csv", "row", lambda rng, x: _with(x, _any(rng, x), 3, "1e300")),
-    ("a cell too few", "curves.csv", "row", _cut_cell),
-    ("cut off in the middle of a row", "curves.csv", "row", _cut_row),
-    ("the header is gone", "curves.csv", "row 1", lambda _, x: x[1:]),
-    ("no rows", "curves.csv", "curves.csv", lambda _, x: x[:1]),
-    ("a particle without sizes", "particles.csv", "particles.csv", lambda _, x: x[:-1]),
-    ("a diameter of zero", "particles.csv", "row", lambda _, x: _with(x, 2, 1, "0")),
-    ("an unknown unit", "curves.csv", "column", lambda _, x: [x[0].replace("force_mN", "force_kN3"), *x[1:]]),
-    (
-        "rows of two tests mixed up",
-        "curves.csv",
-        "time",
-        lambda rng, x: [x[0], *np.array(x[1:])[rng.permutation(len(x) - 1)].tolist()],
-    ),
-    ("nonsense in addition", "campaign.toml", "campaign.toml", lambda _, x: [*x, "control = ["]),
-]
-
-
-def _damaged(name: str, file: str, says: str, change: Callable) -> Kind:
-    def damage(rng: np.random.Generator, folder: Path) -> None:
-        place = folder / file
-        lines = place.read_text(encoding="utf-8").splitlines()
-        place.write_text("\n".join(change(rng, lines)) + "\n", encoding="utf-8")
-
-    return Kind(f"file: {name}", plain, refused=True, says=says, damage=damage)
-
-
-KINDS += [_damaged(*row) for row in DAMAGES]

@@ -12,6 +12,22 @@ from random import Random
 
 from mutators import mutate, mutate_json
 
+from mcc_jax import load
+from mcc_jax._archive import encode
+from mcc_jax.calibrate import read_priors
+from mcc_jax.campaign import (
+    check_campaign,
+    humidities,
+    read_campaign,
+    read_diameters,
+    read_instrument_file,
+    write_campaign,
+)
+from mcc_jax.dem import load_state
+from mcc_jax.discovery import Discovery
+from mcc_jax.report import read_results, report_page
+from mcc_jax.simulate import read_programme
+
 SAMPLES = Path(__file__).parent / "samples"
 Case = dict[str, bytes]
 
@@ -76,17 +92,11 @@ def diameters(rng: Random, whole: Case) -> Case:
     return {"text": mutate(rng, b"200.0,190.5,1.8e2", b"1,2,3")}
 
 
-def read_campaign(folder: Path) -> None:
-    from mcc_jax.campaign import check_campaign, humidities, read_campaign
-
-    campaign = read_campaign(folder)
-    check_campaign(campaign, file=folder)
-    humidities(campaign)
+def read_folder(folder: Path) -> None:
+    humidities(check_campaign(read_campaign(folder), file=folder))
 
 
-def read_diameters(folder: Path) -> None:
-    from mcc_jax.campaign import read_diameters
-
+def read_sizes(folder: Path) -> None:
     text = folder / "text"
     read_diameters(text.read_bytes().decode("utf-8", "replace") if text.exists() else folder / "particles.csv")
 
@@ -95,8 +105,6 @@ def convert(name: str, mapping: str | None = None) -> Callable[[Path], None]:
     """What `mcc-jax convert` does: read, write, and what was written must read back the same."""
 
     def read(folder: Path) -> None:
-        from mcc_jax.campaign import read_campaign, read_instrument_file, write_campaign
-
         described = None if mapping is None else folder / mapping
         sizes = None if mapping is not None else [200.0, 190.0, 180.0]
         campaign = read_instrument_file(folder / name, diameters_um=sizes, mapping=described)
@@ -110,28 +118,13 @@ def convert(name: str, mapping: str | None = None) -> Callable[[Path], None]:
     return read
 
 
-def read_priors(folder: Path) -> None:
-    from mcc_jax.calibrate import read_priors
-
-    read_priors(folder / "priors.toml")
-
-
-def read_programme(folder: Path) -> None:
-    from mcc_jax.simulate import read_programme
-
-    read_programme(folder / "programme.toml")
-
-
-def read_results(folder: Path) -> None:
-    from mcc_jax.report import read_results
-
-    read_results(folder)
-
-
 def report(folder: Path) -> None:
-    from mcc_jax.report import read_results, report_page
-
     report_page(read_results(folder)).encode("utf-8")
+
+
+def of_file(name: str, share: float, file: str, read: Callable[[Path], object]) -> Reader:
+    """A reader of one file."""
+    return Reader(name, share, {file: sample(file)}, bytes_of(file), lambda folder: read(folder / file))
 
 
 def zipped(member: bytes) -> bytes:
@@ -140,12 +133,6 @@ def zipped(member: bytes) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(zipfile.ZipInfo("test.txt"), member)
     return buffer.getvalue()
-
-
-def read_state(folder: Path) -> None:
-    from mcc_jax.dem import load_state
-
-    load_state(folder / "state.msgpack")
 
 
 FOLDER, MAPPED, HEADED = samples("campaign"), samples("mapped"), samples("headed")
@@ -157,35 +144,21 @@ INSTRUMENTS = (
     ("Micro Materials", "micromaterials.txt"),
 )
 SAVED = "discovery.msgpack"
-
-
-def saved_discovery() -> bytes:
-    from mcc_jax._archive import encode
-    from mcc_jax.discovery import Discovery
-
-    return encode(Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 2.0))
-
-
-def load_result(folder: Path) -> object:
-    from mcc_jax import load
-
-    return load(folder)
-
-
-DISCOVERY = {"discovery.json": sample("results/discovery.json"), SAVED: saved_discovery()}
+NO_GAP = Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 2.0)
+DISCOVERY = {"discovery.json": sample("results/discovery.json"), SAVED: encode(NO_GAP)}
 READERS = (
-    *(Reader(name, 4, FOLDER, bytes_of(name), read_campaign) for name in FOLDER),
-    Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_diameters),
+    *(Reader(name, 4, FOLDER, bytes_of(name), read_folder) for name in FOLDER),
+    Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_sizes),
     *(Reader(label, 4, {name: sample(name)}, bytes_of(name), convert(name)) for label, name in INSTRUMENTS),
     Reader("archive", 5, ZIP, bytes_of("tests.zip"), convert("tests.zip")),
     Reader("mapped table", 4, MAPPED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
     Reader("mapping", 4, MAPPED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
     Reader("headed table", 4, HEADED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
     Reader("headed mapping", 4, HEADED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
-    Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
-    Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
+    of_file("priors", 2, "priors.toml", read_priors),
+    of_file("programme", 2, "programme.toml", read_programme),
     Reader("discovery.json", 2, CAMPAIGN | DISCOVERY, values_of("discovery.json"), read_results),
-    Reader("saved discovery", 2, {SAVED: DISCOVERY[SAVED]}, bytes_of(SAVED), load_result),
-    Reader("saved state", 1, {"state.msgpack": sample("state.msgpack")}, bytes_of("state.msgpack"), read_state),
+    Reader("saved discovery", 2, {SAVED: DISCOVERY[SAVED]}, bytes_of(SAVED), load),
+    of_file("saved state", 1, "state.msgpack", load_state),
     Reader("report page", 0.05, CAMPAIGN | DISCOVERY, values_of("discovery.json"), report),
 )

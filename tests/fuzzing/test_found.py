@@ -5,20 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers import refusal
 
-from mcc_jax import InputError
 from mcc_jax.calibrate import read_priors
 from mcc_jax.campaign import read_diameters, read_instrument_file
 
 SAMPLES = Path(__file__).parent / "samples"
 SIZES = [200.0, 190.0, 180.0]
-
-
-def refused(read, *arguments, **options) -> str:
-    with pytest.raises(InputError) as caught:
-        read(*arguments, **options)
-    assert str(caught.value).isprintable()
-    return str(caught.value)
 
 
 INSTRUMENTS = {
@@ -42,7 +35,7 @@ def test_instruments_files(tmp_path, case):
     if words is None:  # what cannot be understood of the header is no reason to refuse whole tests
         assert len(read_instrument_file(file, diameters_um=SIZES)) == 2
     else:
-        assert words in refused(read_instrument_file, file, diameters_um=SIZES)
+        assert words in refusal(read_instrument_file, file, diameters_um=SIZES)
 
 
 def test_many_empty_lines_behind_the_samples(tmp_path):
@@ -68,9 +61,9 @@ def test_toml(tmp_path, text, words):
     if words is None:
         assert read_priors(tmp_path / "p.toml").a.mean in (1.0, -(2.0**63))
     else:
-        assert words in refused(read_priors, tmp_path / "p.toml")
+        assert words in refusal(read_priors, tmp_path / "p.toml")
 
 
 def test_three_long_numbers_are_no_file():
-    assert "too large" in refused(read_diameters, f"1,2,{'9' * 300}")
-    assert "not a number" in refused(read_diameters, f"1,2,{'x' * 300}")
+    assert "too large" in refusal(read_diameters, f"1,2,{'9' * 300}")
+    assert "not a number" in refusal(read_diameters, f"1,2,{'x' * 300}")

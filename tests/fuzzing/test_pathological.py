@@ -33,7 +33,6 @@ REFUSED = (
     "one name twice",
     "force and displacement of unlike lengths",
 )
-FILES = ("a force that is text", "cut off in the middle of a row", "a diameter of zero", "rows of two tests mixed up")
 
 
 @pytest.mark.parametrize("name", FITTED)
@@ -42,10 +41,7 @@ def test_ends_in_a_result(name):
     assert (found.how, found.fault) in [("converged", ""), ("not converged", "")], found
 
 
-@pytest.mark.parametrize(
-    "name",
-    [kind.name for kind in KINDS if " cycles" in kind.name],
-)
+@pytest.mark.parametrize("name", [kind.name for kind in KINDS if " cycles" in kind.name])
 def test_hundreds_of_cycles_are_selected(name):
     campaign = campaign_of(BY_NAME[name], 0)
     chosen = select(campaign)
@@ -63,7 +59,7 @@ def test_ends_in_one_line_with_a_remedy(name, method):
     assert (found.how, found.fault) == ("refused", ""), found
 
 
-@pytest.mark.parametrize("name", ["file: " + file for file in FILES] + ["unloading only", "hold only"])
+@pytest.mark.parametrize("name", ["unloading only", "hold only"])
 def test_command_ends_in_one_line(name):
     found = run_one(BY_NAME[name], 1, "command least-squares")
     assert (found.how, found.fault) == ("refused", ""), found

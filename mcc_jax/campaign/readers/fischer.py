@@ -29,8 +29,8 @@ def read(lines: list[str], file: Path) -> Tests:
 
     Raises `InputError` if a test is cut off or damaged, or tests are missing.
     """
-    starts = [i for i, line in enumerate(lines) if _TEST.match(line)]
-    labels = [match.groups() for i in starts if (match := _TEST.match(lines[i]))]
+    found = {i: match.groups() for i, line in enumerate(lines) if (match := _TEST.match(line))}
+    starts, labels = list(found), list(found.values())
     single = len({block for block, _ in labels}) == 1
     curves: dict[str, Curve] = {}
     results: dict[str, list[str]] = {}

@@ -1,8 +1,7 @@
 """A folder of instrument files as one campaign.
 
-Which files are read: all that lie in the folder itself, in the natural order of their names (2 before 10), but for
-those that the rule `passed_over` names and those that the user skips. Every other file must be readable: one that is
-not is an error that says how to leave it out. A test is called like its file without the ending; where a file holds
+All files in the folder itself are read, in the natural order of their names (2 before 10), but for those of
+`passed_over` and those that the user leaves out. A test is called like its file without the ending; where a file holds
 several tests, a hyphen and the test's own name follow.
 """
 
@@ -20,7 +19,6 @@ from typing import Any
 from ..._errors import InputError
 from ..._format import counted, first_few
 from ..findings import Finding
-from ..schema import Control
 from ..table import read_bytes, same_text
 from .text import Tests
 
@@ -30,9 +28,9 @@ NO_DATA = frozenset(
 )
 """Endings of pictures, documents and settings, in which no instrument writes samples."""
 _READ_ME = re.compile(r"(read[-_ ]?me|licen[cs]e)(\..*)?", re.IGNORECASE)
-LONGEST_LIST = 64
-"""Longer lists of numbers than this (blocks of approach and drift) are not kept of many files: as TOML they would
-outgrow the curves, and are still in the files."""
+LONGEST_LIST = (
+    64  # longer ones (blocks of approach and drift) are not kept of many files: they would outgrow the curves
+)
 _SHOWN = 6
 
 
@@ -75,15 +73,17 @@ def read_folder(
         except InputError as error:
             failed[file] = error
     if failed:
-        raise _unreadable(failed, len(files))
-    for each in same.values():
-        if len(each) > 1:
-            sentence = f"{_listed(each)} hold the same bytes, so one test counts {len(each)} times"
-            remedy = f"If it is one particle, leave it out with {_leave_out(each[1:])}"
-            names = tuple(same_text(file.stem) for file in each)
-            findings.append(Finding("duplicates", "warning", sentence, remedy, names))
+        error = next(iter(failed.values()))
+        error = error.changed(problem=f"{error.problem} ({len(failed)} of {len(files)} files cannot be read)")
+        raise error if len(failed) == len(files) else _or_leave_out(error, list(failed))
+    for alike in same.values():
+        if len(alike) > 1:
+            sentence = f"{_listed(alike)} hold the same bytes, so one test counts {len(alike)} times"
+            remedy = f"If it is one particle, leave it out with {_leave_out(alike[1:])}"
+            findings.append(Finding("duplicates", "warning", sentence, remedy, tuple(same_text(f.stem) for f in alike)))
     form = f"{counted(len(files), 'file')}, {' and '.join(sorted({tests.format for tests in found.values()}))}"
-    whole = Tests({}, form, _control(found), _other(found))
+    controls = {tests.control for tests in found.values()}
+    whole = Tests({}, form, controls.pop() if len(controls) == 1 else None, _other(found))
     own = Counter(name for tests in found.values() for name in tests.curves)
     keys: dict[str, tuple[str, ...]] = {}
     origin: dict[str, Path] = {}
@@ -92,19 +92,18 @@ def read_folder(
             full = same_text(file.stem) if len(tests.curves) == 1 else f"{same_text(file.stem)}-{name}"
             if full in origin:
                 problem = f"this file and {origin[full].name} both give a test the name {full!r}"
-                raise InputError(
-                    problem, file=file, remedy=f"Rename one of them, or leave one out with {_leave_out([file])}"
-                )
+                raise _or_leave_out(InputError(problem, file=file, remedy="Rename one of them"), [file])
             whole.curves[full], origin[full] = curve, file
             keys[full] = (full, *names_of(file), *([name] if own[name] == 1 else []))
             if (size := tests.diameters_um.get(name)) is not None:
-                whole.diameters_um[full] = size if isinstance(size, list) else _or_skip(size, [file])
+                whole.diameters_um[full] = size if isinstance(size, list) else _or_leave_out(size, [file])
             if name in tests.missing:
                 whole.missing[full] = tests.missing[name]
     return whole, keys, findings
 
 
 def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]]:
+    """The files of a folder to read, and what is left out."""
     try:
         entries = sorted(folder.iterdir(), key=lambda entry: natural(entry.name))
         inside = [entry for entry in entries if entry.is_dir()]
@@ -113,23 +112,23 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
         raise InputError(problem, file=folder, remedy="Check the permissions") from None
     if {"particles.csv", "curves.csv"} <= {entry.name for entry in entries}:
         raise InputError("is a campaign already", file=folder, remedy="Give the folder with the instrument files")
-    quiet = [entry for entry in entries if entry not in inside and passed_over(entry.name)]
-    rest = [entry for entry in entries if entry not in inside and entry not in quiet]
+    files = [entry for entry in entries if entry not in inside]
     for pattern in skip:
-        if not any(_fits(entry, pattern) for entry in (*rest, *quiet)):
+        if not any(_fits(entry, pattern) for entry in files):
             problem = f"--leave-out {shlex.quote(pattern)} fits no file"
             raise InputError(problem, file=folder, remedy="Give a name as in the folder, or a pattern")
-    skipped = list(dict.fromkeys(entry for pattern in skip for entry in rest if _fits(entry, pattern)))
-    files = [entry for entry in rest if entry not in skipped]
+    quiet = [file for file in files if passed_over(file.name)]
+    skipped = [file for file in files if file not in quiet and any(_fits(file, pattern) for pattern in skip)]
+    files = [file for file in files if file not in (*quiet, *skipped)]
     if not files:
         below = f"; give one of the folders in it: {_listed(inside)}" if inside else ""
         raise InputError("there is no instrument file in the folder", file=folder, remedy=f"Check the path{below}")
-    sentences = {
+    left_out = {
         f"{counted(len(quiet), 'file')} ignored because of the name: {_listed(quiet)}": quiet,
         f"{counted(len(inside), 'folder')} in it not entered: {_listed(inside)}": inside,
         f"{counted(len(skipped), 'file')} skipped as asked: {_listed(skipped)}": skipped,
     }
-    return files, [Finding("files", "info", sentence) for sentence, some in sentences.items() if some]
+    return files, [Finding("files", "info", sentence) for sentence, some in left_out.items() if some]
 
 
 def _fits(entry: Path, pattern: str) -> bool:
@@ -147,41 +146,18 @@ def _leave_out(files: Iterable[Path]) -> str:
     return " ".join(f"--leave-out {shlex.quote(file.name)}" for file in files)
 
 
-def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
-    error = next(iter(failed.values()))
-    if len(failed) == files:
-        more = f". All {files} files fail in the same way" if files > 1 else ""
-        return error.changed(remedy=(error.remedy or "").rstrip(".") + more)
-    return _or_skip(error, list(failed), f" ({len(failed)} of {files} files cannot be read)" if len(failed) > 1 else "")
-
-
-def _or_skip(error: InputError, files: Sequence[Path], others: str = "") -> InputError:
+def _or_leave_out(error: InputError, files: Sequence[Path]) -> InputError:
     """The same error, with the way to leave the files out."""
-    how = _leave_out(files[:_SHOWN]) + (" ..." if len(files) > _SHOWN else "")
-    remedy = ", ".join([*([error.remedy.rstrip(".")] if error.remedy else []), f"or leave it out{others} with {how}"])
-    return error.changed(remedy=remedy)
-
-
-def _control(found: dict[Path, Tests]) -> Control | None:
-    """The controlled quantity, if it is the same for all; where one file does not say, it is not known."""
-    by: dict[Control | None, Path] = {
-        tests.control: file for file, tests in reversed(found.items())
-    }  # the first of each
-    if "load" in by and "displacement" in by:
-        problem = f"the test is controlled by displacement, that of {by['load'].name} by load"
-        remedy = "Convert tests of two kinds separately, with --leave-out"
-        raise InputError(problem, file=by["displacement"], remedy=remedy)
-    return next(iter(by)) if len(by) == 1 else None
+    options = _leave_out(files[:_SHOWN]) + (" ..." if len(files) > _SHOWN else "")
+    return error.changed(remedy=f"{(error.remedy or 'Correct it').rstrip('.')}, or leave it out with {options}")
 
 
 def _other(found: dict[Path, Tests]) -> dict[str, Any]:
-    """What the files say besides the curves: what all say alike once, the rest by file, without long lists."""
-    each = {file.name: _short(tests.other) for file, tests in found.items() if tests.other}
-    common = next(iter(each.values()), {})
-    common = {k: v for k, v in common.items() if len(each) == len(found) and all(o.get(k) == v for o in each.values())}
-    rest = {name: {k: v for k, v in other.items() if k not in common} for name, other in each.items()}
-    rest = {name: other for name, other in rest.items() if other}
-    return common | ({"files": rest} if rest else {})
+    """What the files say besides the curves, without long lists: once if all say the same, else by file."""
+    each = {file.name: _short(tests.other) for file, tests in found.items()}
+    first = next(iter(each.values()))
+    said = {name: other for name, other in each.items() if other}
+    return first if all(other == first for other in each.values()) else {"files": said}
 
 
 def _short(value: Any) -> Any:

@@ -1,12 +1,8 @@
 """The two exports of Hysitron indenters, one test in each file, named by the file. Nothing in them is corrected.
 
-`.hld`: a header of `Key: value unit` lines, then blocks of approach, drift and test data. The test block is the curve
-(`Time_s`, `Force_uN`, `Disp_nm`). Everything else is kept in `Metadata.other`: the header as text, machine compliance
-and drift rate with their units in the key, the programmed segments, and the approach and drift blocks and the test
-block's further columns as lists.
-
-Load-control text: a date, `Number of Points = N`, column names, segments separated by empty lines. The approach is part
-of the curve, as in the file. The columns in volts and the lengths of the segments are kept in `Metadata.other`.
+`.hld`: a header of `Key: value unit` lines, then blocks of approach, drift and test data. Load-control text: a date,
+`Number of Points = N`, column names, segments separated by empty lines; the approach is part of the curve. What is not
+the curve is kept in `Metadata.other`.
 """
 
 from __future__ import annotations

@@ -14,26 +14,26 @@ import numpy as np
 
 from ..._errors import InputError
 from ..._format import counted
-from ..columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
-from ..schema import Curve
+from ..schema import Curve, fault_of
 from ..table import (
     APOSTROPHES,
+    DIMENSIONS,
+    LARGEST_MAGNITUDE,
     binary_kind,
+    convert,
     filled,
     parse_number,
     same_text,
     split,
     thousands_for_decimals,
     thousands_mark,
+    unit_factor,
 )
-from ..validate import check_magnitudes
 from ..workbook import is_workbook, read_sheet
-from .diameters import check_triple
-from .mapping import DIMENSIONS, MappingFile
-from .text import Tests, checked_curve, decode_lines
+from .mapping import MappingFile
+from .text import Tests, decode_lines
 
-_FURTHEST = 200
-"""Rows above a header found by `begin`, within which it is sought again; an instrument's preamble has a few dozen."""
+_FURTHEST = 200  # rows above a header found by `begin`, within which it is sought again; a preamble has a few dozen
 _OWN_DIAMETER = "Add it to the file, or give this test's diameters in a table by --diameters"
 
 _Reading = float | None  # NaN where it is marked as missing, None where the cell holds something else
@@ -46,9 +46,8 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     """
     reader, name = _Reader(_Rows(data, file, mapping), file, mapping), mapping.file.name
     reader.read()
-    if not reader.samples and not reader.missing:
-        end = "end" if mapping.end else "skip_footer"
-        raise reader.wrong("there are no rows of data", f"Check skip_rows, header_rows and {end} in {name}")
+    if not reader.has_data:
+        raise reader.wrong("there are no rows of data", f"Check skip_rows, header_rows, end and skip_footer in {name}")
     for test in reader.missing:
         if test not in reader.samples:
             remedy = f"Check missing in {name}, or remove the test's rows"
@@ -121,20 +120,29 @@ class _Reader:
         self.diameters_um: dict[str, list[float] | InputError] = {}
         self.count = len(rows.rows)
         self.between = False  # whether the next sample begins a test
-        self.header_came_again = False
 
     def wrong(self, problem: str, remedy: str, i: int | None = None, column: str | int | None = None) -> InputError:
         """The error for the file, or for its row of index `i`."""
         row, named = None if i is None else i + 1, None if column is None else str(column)
         return InputError(problem, file=self.file, row=row, column=named, remedy=remedy)
 
+    @property
+    def has_data(self) -> bool:
+        """Whether there was a row of data."""
+        return bool(self.samples or self.missing)
+
     def read(self) -> None:
         """Read all rows. Raises `InputError` at the first row that is neither sample, header nor footer."""
         rows, mapping = self.rows, self.mapping
-        head = self._head()
+        head = mapping.skip_rows or 0
+        if mapping.begin is not None:
+            head = next((i for i in range(self.count) if rows.begins(i, mapping.begin)), self.count)
+            if head == self.count:
+                raise self.wrong(f"no row begins with {mapping.begin!r}", f"Correct begin in {mapping.file.name}")
         i = head + mapping.header_rows
         self.header = rows.cells(head) if mapping.header_rows and head < self.count else None
-        self.stop = self._stop(i)
+        full = [i, *(j for j in range(i, self.count) if not rows.blank(j))]
+        self.stop = full[max(-mapping.skip_footer, -len(full))] if mapping.skip_footer else self.count
         self.where = {name: self._place(source.column, head) for name, source in mapping.sources.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
         first = self.header
@@ -158,26 +166,34 @@ class _Reader:
                     raise self.wrong("the header comes again, so this is more than one test", remedy, top)
                 sizes = self._diameters(i, top) if top > i else sizes
                 self.between, ended = self.between or mapping.tests == "header", False
-                self.header_came_again = self.header is not None
                 i = below - 1
             else:
                 ended = ended or rows.begins(i, mapping.end)
                 if not ended:
                     if mapping.tests in ("blank line", "header"):
-                        block += self.between and self._has_data
+                        block += self.between and self.has_data
                     self._take(i, readings, block, sizes)
             i += 1
 
-    @property
-    def _has_data(self) -> bool:
-        return bool(self.samples or self.missing)
-
     def _take(self, i: int, readings: list[_Reading], block: int, sizes: list[float] | InputError | None) -> None:
         """Keep a row of data, of the test of this number where the file does not name it, with its diameters."""
-        cells = self._fit(i)
+        cells = self.rows.cells(i)
+        if len(cells) != self.raw_width and not (len(cells) >= self.width >= filled(cells)):
+            count = len(cells) if len(cells) < self.width else filled(cells)
+            remedy = "Fill the row or delete it; if the file was cut off here, export it again"
+            if count > self.width:
+                remedy = f"Check delimiter and decimal_mark in {self.mapping.file.name}, and quote text that holds the "
+                remedy += "delimiter, and every number with a decimal comma where commas separate the columns"
+            problem = f"{counted(count, 'cell')} where {self.width} are expected"
+            raise self.wrong(problem, self._no_sample(cells) or remedy, i)
         missing = any(number != number for number in readings)
         if None in readings and not missing:
-            raise self._no_number(cells, readings.index(None), i)
+            quantity = self.wanted[readings.index(None)]
+            try:
+                self._number(cells[self.where[quantity]])
+            except ValueError as error:
+                remedy = self._number_remedy(cells, cells[self.where[quantity]].strip())
+                raise self.wrong(str(error), remedy, i, self.mapping.sources[quantity].column) from None
         name = self._name(cells, block, i)
         self.between = False
         if missing:
@@ -187,16 +203,6 @@ class _Reader:
             samples.append((i, len(samples) + self.missing[name], readings))
         if sizes is not None:
             self.diameters_um.setdefault(name, sizes)
-
-    def _head(self) -> int:
-        """The index of the header, or of the first row of data where there is none."""
-        begin = self.mapping.begin
-        if begin is None:
-            return self.mapping.skip_rows or 0
-        found = next((i for i in range(self.count) if self.rows.begins(i, begin)), None)
-        if found is None:
-            raise self.wrong(f"no row begins with {begin!r}", f"Correct begin in {self.mapping.file.name}")
-        return found
 
     def _place(self, column: str | int, head: int) -> int:
         """The index of a column, by its name in the header or its number."""
@@ -210,52 +216,36 @@ class _Reader:
             return found[0]
         if found:
             raise self.wrong(f"there are {len(found)} columns called {column!r}", "Give its number", head)
-        file, close = self.mapping.file.name, get_close_matches(column, names, n=1)
-        other = [word for word, mark in (("semicolon", ";"), ("tab", "\t"), ("comma", ",")) if mark in "".join(names)]
-        if len(names) == 1 and other:
-            remedy = f'If its columns are separated by a {other[0]}, write delimiter = "{other[0]}" in {file}'
-        elif close:
+        known = ", ".join(filter(None, names)) or "none"
+        keys = f"delimiter, skip_rows or begin in {self.mapping.file.name}"
+        remedy = f"There are: {known}; if these are not the names of columns, correct {keys}"
+        if close := get_close_matches(column, names, n=1):
             remedy = f"Did you mean {close[0]!r}?"
-        else:
-            known = ", ".join(filter(None, names)) or "none"
-            remedy = f"There are: {known}; if this is not the header, correct skip_rows or begin in {file}"
         raise self.wrong(f"there is no column {column!r}", remedy, head)
-
-    def _stop(self, start: int) -> int:
-        """The index behind the last row, without the footer."""
-        footer = self.mapping.skip_footer
-        full = [start, *(i for i in range(start, self.count) if not self.rows.blank(i))]
-        return full[max(-footer, -len(full))] if footer else self.count
 
     def _begins_again(self, i: int) -> int | None:
         """The index of the row below, if the rows above the first sample, or those like them, come again at a row."""
         rows, mapping = self.rows, self.mapping
         above = (mapping.skip_rows or 0) if mapping.begin is None else _FURTHEST
+        if self.header is None and not (self.between and self.has_data):
+            return None
         for j in range(i, min(i + above + 1, self.stop)):
+            readings = self._readings(j)
             if self.header is None:
-                if not self.between or not self._has_data:
-                    return None
-                readings = self._readings(j)
                 if None not in readings:
                     return j
                 if any(number is not None and number == number for number in readings):
-                    return None
-            elif rows.begins(j, mapping.begin):
-                self._check_columns(j)
+                    return None  # a damaged sample
+            elif rows.begins(j, mapping.begin) or (mapping.begin is None and rows.cells(j) == self.header):
+                names, first = _names(rows.cells(j)), _names(self.header)
+                for place in self.where.values():
+                    if place >= len(names) or names[place] != first[place]:
+                        problem = f"the header comes again without {first[place]!r} as its column {place + 1}"
+                        raise self.wrong(problem, "Put tests with other columns into a separate file", j)
                 return j + mapping.header_rows
-            elif mapping.begin is None and not rows.blank(j) and rows.cells(j) == self.header:
-                return j + mapping.header_rows
-            elif self._is_sample(j):
+            elif None not in readings:
                 return None
         return None
-
-    def _check_columns(self, i: int) -> None:
-        """Refuse a header that begins like the first and names the columns in another order."""
-        names, first = _names(self.rows.cells(i)), _names(self.header or [])
-        for place in self.where.values():
-            if place >= len(names) or names[place] != first[place]:
-                problem = f"the header comes again without {first[place]!r} as its column {place + 1}"
-                raise self.wrong(problem, "Put tests with other columns into a separate file", i)
 
     # ---- cells -------------------------------------------------------------------------------------------------------
 
@@ -283,41 +273,11 @@ class _Reader:
                 numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
         return texts, numbers
 
-    def _is_sample(self, i: int) -> bool:
-        return None not in self._readings(i)
-
     def _number(self, cell: str) -> float:
         return parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
 
-    def _fit(self, i: int) -> list[str]:
-        """The cells of a row of data, of which those behind the last column are empty."""
-        cells = self.rows.cells(i)
-        if len(cells) == self.raw_width or (len(cells) >= self.width and filled(cells) <= self.width):
-            return cells
-        count = len(cells) if len(cells) < self.width else filled(cells)
-        name = self.mapping.file.name
-        if self._is_footer(i):
-            remedy = self._footer_remedy(i)
-        elif count > self.width and self.mapping.delimiter == self.mapping.decimal_mark:
-            remedy = "Quote every number that has a decimal comma, or separate the columns by another character"
-        elif count > self.width:
-            remedy = f"Check delimiter and decimal_mark in {name}, and quote text that holds the delimiter"
-        else:
-            remedy = "Fill the row or delete it; if the file was cut off here, export it again"
-        raise self.wrong(f"{counted(count, 'cell')} where {self.width} are expected", remedy, i)
-
-    def _no_number(self, cells: list[str], which: int, i: int) -> InputError:
-        quantity = self.wanted[which]
-        cell = cells[self.where[quantity]]
-        try:
-            self._number(cell)
-        except ValueError as error:
-            column = self.mapping.sources[quantity].column
-            return self.wrong(str(error), self._number_remedy(cell.strip(), i), i, column)
-        raise AssertionError
-
-    def _number_remedy(self, cell: str, i: int) -> str:
-        """What to do about a cell that is no number, by what it looks like."""
+    def _number_remedy(self, cells: list[str], cell: str) -> str:
+        """What to do about a cell of a row that is no number, by what it looks like."""
         name, mark = self.mapping.file.name, thousands_mark(cell, self.mapping.decimal_mark)
         if _CLOCK.fullmatch(cell):
             return (
@@ -328,34 +288,20 @@ class _Reader:
             word = {".": "point", ",": "comma"}.get(mark, "apostrophe" if mark in APOSTROPHES else "space")
             other = ' (or decimal_mark = ",")' if mark == "," and cell.count(",") == 1 and "." not in cell else ""
             return f'If the mark separates thousands, write thousands = "{word}"{other} in {name}'
-        if self._is_footer(i):
-            return self._footer_remedy(i)
         if _is_no_reading(cell):
-            return f"Correct the cell, or write missing = [{_quoted(cell)}] in {name} to drop such readings"
-        if any(c.isalpha() for c in cell) and not self._has_data:
-            return f"If this row belongs to the header, correct skip_rows or header_rows in {name}"
-        if any(c.isalpha() for c in cell) and self.between:
-            return f"If the rows above this test are not those above the first, name the header with begin in {name}"
-        return f"Correct the cell, or decimal_mark and unit in {name}"
+            quoted = cell.replace("\\", "\\\\").replace('"', '\\"')
+            return f'Correct the cell, or write missing = ["{quoted}"] in {name} to drop such readings'
+        return self._no_sample(cells) or f"Correct the cell, or decimal_mark and unit in {name}"
 
-    def _is_footer(self, i: int) -> bool:
-        """Whether a row that begins with text has samples above and, in its test, none below."""
-        text = _first(self.rows.cells(i))
-        if not self._has_data or self._reading(text) is not None or _is_no_reading(text):
-            return False
-        stop = self.stop if self.between else self._end_of_test(i)
-        return not any(self._is_sample(j) for j in range(i, stop))
-
-    def _end_of_test(self, i: int) -> int:
-        blank = (j for j in range(i, self.stop) if self.rows.blank(j))
-        return next(blank, self.stop) if self.mapping.tests == "blank line" else self.stop
-
-    def _footer_remedy(self, i: int) -> str:
-        way = f"end = {_quoted(_first(self.rows.cells(i))[:20])}"
-        below = [j for j in range(i, self.stop) if not self.rows.blank(j)]
-        if below[-1] < self._end_of_test(i):
-            way += f" or skip_footer = {len(below) + self.mapping.skip_footer}"
-        return f"If the samples end above it, write {way} in {self.mapping.file.name}"
+    def _no_sample(self, cells: list[str]) -> str | None:
+        """What to do about a row whose first reading is text, and which so perhaps is none of the samples."""
+        place = min(self.where[quantity] for quantity in self.wanted)
+        first = cells[place].strip() if place < len(cells) else ""
+        if self._reading(first) is not None or _is_no_reading(first):
+            return None
+        above, below = "skip_rows, header_rows or begin", "end or skip_footer"
+        keys = f"{above} (above the samples), or {below} (below them)" if self.has_data else above
+        return f"If this row is not a sample, correct {keys} in {self.mapping.file.name}"
 
     # ---- what a test holds besides its readings ----------------------------------------------------------------------
 
@@ -374,23 +320,20 @@ class _Reader:
 
     def _diameters(self, start: int, stop: int) -> list[float] | InputError | None:
         """D1, D2, D3 [um] as the rows from `start` to `stop` hold them, or why not: a table may hold them."""
-        asked = self.mapping.diameters
-        if asked is None:
+        if (asked := self.mapping.diameters) is None:
             return None
         try:
             found = [self._length(name, start, min(stop, self.count)) for name in asked.names]
-            triple = found * 3 if len(found) == 1 else found
-            check_triple(triple, "the header", self.file)
         except InputError as error:
             return error
-        return triple
+        return found * 3 if len(found) == 1 else found
 
     def _length(self, name: str, start: int, stop: int) -> float:
+        """The length [um] in the first row that begins with a name."""
         for i in range(start, stop):
             if not self.rows.begins(i, name):
                 continue
-            text = same_text(" ".join(cell.strip() for cell in self.rows.cells(i) if cell.strip()))
-            rest = text[len(name) :]
+            rest = same_text(" ".join(cell.strip() for cell in self.rows.cells(i) if cell.strip()))[len(name) :]
             if rest[:1].isalnum():
                 continue
             words = rest.replace(":", " ").replace("=", " ").split()
@@ -399,12 +342,12 @@ class _Reader:
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise self.wrong(problem, _OWN_DIAMETER, i)
-            value = self._number(numbers[0])
             try:
-                factor = self.mapping.diameter_factor or unit_factor("".join(units[:1]), LENGTH)
+                factor = self.mapping.diameter_factor or unit_factor("".join(units[:1]), "length")
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
                 raise self.wrong(str(error), remedy, i, name) from None
+            value = self._number(numbers[0])
             if not value > 0:
                 raise self.wrong(f"the diameter {value:g} is not positive", _OWN_DIAMETER, i, name)
             return float(convert(np.array([value]), factor)[0])
@@ -430,26 +373,23 @@ class _Reader:
 
     def curve(self, name: str) -> Curve:
         """A test in canonical units."""
-        mapping, file = self.mapping, self.file
-        at = [i for i, _, _ in self.samples[name]]
-        rows = [i + 1 for i in at]
-        raw = np.array([readings for _, _, readings in self.samples[name]], float).T
-        columns: dict[str, np.ndarray] = {}
-        for quantity, values in zip(self.wanted, raw, strict=True):
-            source = mapping.sources[quantity]
-            columns[quantity] = source.sign * convert(np.ascontiguousarray(values), source.factor)
-            check_magnitudes(columns[quantity], file, rows, str(source.column))
+        mapping, samples = self.mapping, self.samples[name]
+        raw = np.array([readings for _, _, readings in samples], float).T
+        columns = {
+            quantity: mapping.sources[quantity].sign * convert(values.copy(), mapping.sources[quantity].factor)
+            for quantity, values in zip(self.wanted, raw, strict=True)
+        }
         if mapping.pace is not None:
-            order = np.array([order for _, order, _ in self.samples[name]])
-            columns["time"] = mapping.pace.times(columns["displacement"], order)
-            check_magnitudes(columns["time"], file, rows, "time")
-        back = np.flatnonzero(np.diff(columns["time"]) < 0)
-        if len(back) and mapping.tests == "file":
-            before, here = at[int(back[0])], at[int(back[0]) + 1]
-            way = "header" if self.header_came_again else "blank line" if here > before + 1 else "column"
-            remedy = f'If another test begins here, write tests = "{way}" in {mapping.file.name} or split the file'
-            raise self.wrong(f"the time of test {name!r} goes back", remedy, here)
-        return checked_curve(columns["time"], columns["force"], columns["displacement"], file, at, name)
+            columns["time"] = mapping.pace.times(columns["displacement"], np.array([order for _, order, _ in samples]))
+        curve = Curve(columns["time"], columns["force"], columns["displacement"])
+        if (fault := fault_of(name, curve)) is not None:
+            remedy = fault.remedy
+            if fault.channel == "time" and mapping.tests == "file":
+                remedy += '; if another test begins here, write tests = "header", "blank line" or "column" in '
+                remedy += mapping.file.name
+            column = mapping.sources[fault.channel].column if fault.channel in mapping.sources else fault.channel
+            raise self.wrong(fault.problem, remedy, samples[fault.reading][0], column or None)
+        return curve
 
 
 _CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2}:[0-9]{2}(?::[0-9.]+)?.*")
@@ -457,14 +397,6 @@ _CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2
 
 def _names(header: list[str]) -> list[str]:
     return [same_text(name).strip() for name in header]
-
-
-def _first(cells: list[str]) -> str:
-    return next((cell.strip() for cell in cells if cell.strip()), "")
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def _is_no_reading(cell: str) -> bool:

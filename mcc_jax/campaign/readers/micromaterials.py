@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from ..._errors import InputError
 from ...files import UNPACKED_BYTES
@@ -27,35 +27,27 @@ def matches(lines: list[str]) -> bool:
 
 def read(lines: list[str], file: Path) -> Tests:
     """One text file. Raises `InputError` if a row is damaged."""
-    return Tests({file.stem: _curve(lines, file, file.stem)}, "Micro Materials text")
+    at = range(filled(lines))
+    block = number_block(lines, at, ("t", "h", "F"), file)
+    curve = checked_curve(block["t"], block["F"], block["h"] / 1e3, file, at, file.stem)
+    return Tests({file.stem: curve}, "Micro Materials text")
 
 
 def read_zip(data: bytes, file: Path) -> Tests:
-    """An archive of text files, one test each.
-
-    Raises `InputError` if the archive or a file in it is damaged, too large or no such test.
-    """
+    """An archive of such files. Raises `InputError` if it or a file in it is damaged, too large or no such test."""
     curves: dict[str, Curve] = {}
     for path, content in _entries(data, file):
-        inside = Path(f"{file}") / path
-        name = PurePosixPath(path).stem
-        lines = decode_lines(content)
+        inside, lines = Path(f"{file}", path), decode_lines(content)
         if not matches(lines):
             problem = "is no Micro Materials text (three columns t, h, F with six decimals)"
             remedy = "Remove it from the archive, or unpack it and write a mapping file"
             raise InputError(problem, file=inside, remedy=remedy)
-        if name in curves:
-            raise InputError(f"two tests are called {name!r}", file=inside, remedy="Rename one of them")
-        curves[name] = _curve(lines, inside, name)
+        if inside.stem in curves:
+            raise InputError(f"two tests are called {inside.stem!r}", file=inside, remedy="Rename one of them")
+        curves |= read(lines, inside).curves
     if not curves:
         raise InputError("the archive holds no file", file=file, remedy="Export it again")
     return Tests(curves, "Micro Materials archive")
-
-
-def _curve(lines: list[str], file: Path, name: str) -> Curve:
-    at = range(filled(lines))
-    block = number_block(lines, at, ("t", "h", "F"), file)
-    return checked_curve(block["t"], block["F"], block["h"] / 1e3, file, at, name)
 
 
 def _entries(data: bytes, file: Path) -> list[tuple[str, bytes]]:

@@ -11,15 +11,14 @@ from ... import arguments
 from ..._errors import InputError
 from ..._format import counted
 from ..findings import Finding
-from ..schema import CHANNELS, Campaign, Metadata
+from ..schema import CHANNELS, Campaign, Metadata, check_campaign
 from ..table import binary_kind, read_bytes
-from ..validate import check_campaign
 from ..workbook import is_workbook
 from . import fischer, hysitron, micromaterials
 from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
 from .mapped import read_mapped
-from .mapping import EXAMPLE, MappingFile, read_mapping, suggested_mapping
+from .mapping import MappingFile, read_mapping
 from .text import Tests, decode_lines
 
 FORMATS = {
@@ -29,6 +28,7 @@ FORMATS = {
     "Micro Materials text (also many in one zip)": (micromaterials.matches, micromaterials.read),
 }
 """Of each known format how it is recognised by its lines, and how they are read."""
+_HOW = "Describe it in a mapping file and give that with --mapping; mcc-jax convert --help shows one"
 
 
 def read_instrument_file(
@@ -40,21 +40,17 @@ def read_instrument_file(
 ) -> Campaign:
     """An instrument's export, or a folder of exports, as a campaign; recognised by the content.
 
-    Only units are converted (to mN, um, s) and, where a mapping says so, signs; nothing is shifted, smoothed,
-    cut or corrected. What the file says besides the curves is kept in `Metadata.other`; what was left out on the
-    user's word (rows with missing readings, files) is there under "conversion". Particles have the tests' names.
+    Only units are converted (to mN, um, s) and, where a mapping says so, signs. What the file says besides the curves
+    is kept in `Metadata.other`; what was left out (rows with missing readings, files) is there under "conversion".
 
     Args:
-        path: the file: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip, or
-            anything that a mapping file describes; or a folder of such files, see `readers.folder`.
+        path: an export of Fischer HM, Hysitron or Micro Materials, anything that a mapping describes, or a folder.
         diameters_um: D1, D2, D3 [um] for all tests, or a mapping from tests, or names of files, to such triples; see
             `read_diameters`. It counts before what the mapping or the files say.
-        mapping: a TOML file that describes the table, see `mcc_jax.campaign.readers.mapping`; or several, for a folder
-            with files of several kinds: each file is read by the one that fits it.
+        mapping: a TOML file that describes the table; or several, of which each file is read by the one that fits it.
         skip: names of files in the folder that are left out; may hold "*", "?".
 
-    Raises:
-        InputError: if the file is unknown or damaged, or diameters are missing.
+    `InputError` if a file is unknown or damaged, or diameters are missing.
     """
     place = arguments.file_path(path, "path")
     given = () if mapping is None else (mapping,) if isinstance(mapping, str | os.PathLike) else tuple(mapping)
@@ -102,7 +98,7 @@ def read_instrument_file(
 
 def _read_known(data: bytes, file: Path) -> Tests:
     if is_workbook(data):
-        raise InputError("an Excel workbook has no known format", file=file, remedy=EXAMPLE)
+        raise InputError("an Excel workbook has no known format", file=file, remedy=_HOW)
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return micromaterials.read_zip(data, file)
     kind = binary_kind(data)
@@ -114,14 +110,11 @@ def _read_known(data: bytes, file: Path) -> Tests:
         if matches(lines):
             return read(lines, file)
     problem = f"the format is not known (known: {', '.join(FORMATS)})"
-    raise InputError(problem, file=file, remedy=suggested_mapping(data))
+    raise InputError(problem, file=file, remedy=_HOW)
 
 
 def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Tests:
-    """The tests of a file by the one mapping that fits it.
-
-    Raises `InputError` if none fits, or two fit and read it differently: which is right is not for a program to guess.
-    """
+    """The tests of a file by the one mapping that fits it; an error if two fit and read it differently."""
     fitting: list[tuple[MappingFile, Tests]] = []
     failed: list[InputError] = []
     for one in mappings:

@@ -12,32 +12,22 @@ import numpy as np
 
 from ..._errors import InputError
 from ..._format import counted
-from ..schema import Control, Curve
+from ..schema import Control, Curve, fault_of
 from ..table import Table, check_header
-from ..validate import fault_of
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 
 
 @dataclass(frozen=True)
 class Tests:
-    """What a reader finds in a file: named curves, and what the file says about them.
-
-    Attributes:
-        curves: the tests by their names.
-        format: what kind of file it is, in words.
-        control: the controlled quantity, where the file or a mapping says so.
-        other: what else the file says, kept as it is.
-        diameters_um: D1, D2, D3 [um] of tests whose file should hold them, or why it does not.
-        missing: how many rows with a missing reading were dropped, by test.
-    """
+    """What a reader finds in a file: named curves, and what the file says about them."""
 
     curves: dict[str, Curve]
-    format: str
+    format: str  # in words
     control: Control | None = None
-    other: dict[str, Any] = field(default_factory=dict)
-    diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)
-    missing: dict[str, int] = field(default_factory=dict)
+    other: dict[str, Any] = field(default_factory=dict)  # what else the file says, kept as it is
+    diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)  # or why it does not hold them
+    missing: dict[str, int] = field(default_factory=dict)  # how many rows with a missing reading were dropped, by test
 
 
 def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = None) -> list[str]:
