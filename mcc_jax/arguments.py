@@ -184,12 +184,12 @@ def diameters(value: Any) -> np.ndarray:
     return array
 
 
-def one_particle(value: Any) -> np.ndarray:
+def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
     """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite."""
-    array = floats(value, "diameters_um", shape="D1, D2, D3 [um] of one particle")
+    array = floats(value, name, shape="D1, D2, D3 [um] of one particle")
     if array.shape == (3,) and (np.isfinite(array) & (array > 0)).all():
         return array
-    must = "diameters_um must be the three positive diameters D1, D2, D3 [um] of a particle"
+    must = f"{name} must be the three positive diameters D1, D2, D3 [um] of a particle"
     raise InputError(f"{must}, got {shown(array.tolist())}")
 
 
