@@ -46,7 +46,7 @@ CLIMB = 8.0  # displacement must grow over loading by this many times its noise,
 # turning points that are always kept would be most of what is left.
 TURNS_SHARE = 4
 # Records are padded to one of these lengths, beyond them in steps of the last: similar campaigns share a compilation.
-LENGTHS = (64, 128, 192, 320, 448)
+LENGTHS = (64, 192, 448)
 
 
 class Tests(eqx.Module):

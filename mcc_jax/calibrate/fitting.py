@@ -210,7 +210,7 @@ class _Fitter:
         if blocks.number > NOISE_BLOCKS:
             rows = np.linspace(0, len(self.tests) - 1, NOISE_BLOCKS * blocks.size).astype(int)
             blocks = Blocks(len(rows), blocks.size)
-            given = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), given)
+            given = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), given)
         shared = m.zero_prior[1], m.correlation, m.along
 
         def log_likelihoods(logs: Array) -> Array:

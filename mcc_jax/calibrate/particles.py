@@ -84,7 +84,7 @@ class ExactLikelihood(eqx.Module):
 
     def some(self, which: np.ndarray) -> ExactLikelihood:
         """Some of the tests."""
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]) if jnp.ndim(x) else x, self)
+        return jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which]) if jnp.ndim(x) else x, self)
 
     def log_likelihood(self, population: Population, drawn: ParticleDraw) -> Float[Array, " particles"]:
         """Log likelihood of each test at drawn parameters, times the prior density of its zero."""
@@ -202,12 +202,12 @@ class Drawer:
         def one(first: int) -> list[np.ndarray]:
             rows = np.minimum(np.arange(first, first + chunk), draws - 1)  # the last one pads the last chunk
             keys = blocks.keys(key if common or not first else jax.random.fold_in(key, first))
-            some = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population)
+            some = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), population)
             found = blocks.all(draw_particles, (keys, self._exact), some, candidates, same)
             return [np.asarray(v).swapaxes(0, 1) for v in found]
 
         # Several processes exchange the numbers of their blocks, in one order.
-        found = (side_by_side if blocks.number == 1 else map)(one, range(0, draws, chunk))
+        found = (side_by_side if blocks.processes == 1 else map)(one, range(0, draws, chunk))
         return ParticleDraws(*(cast(Any, np.concatenate(several)[:draws]) for several in zip(*found, strict=True)))
 
     def some(

@@ -18,7 +18,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -29,28 +28,26 @@ from .data import Tests
 
 AXIS = "particles"  # the only axis of the mesh of a process's devices
 
-# Sizes of a campaign that is one block: those between are padded, so that few sizes are compiled. The last is the
-# most particles of a block: on a processor larger ones are no faster, smaller ones slower (`bench_scale.py`).
-BLOCKS = (4, 8, 12, 16, 20, 24, 32, 40, 48, 64)
+# Particles of a block: few, so that campaigns of every size share their programs; of many particles more, since a
+# call takes time of its own (`bench_scale.py`).
+BLOCK, MANY = 8, 64
+# What concerns the population is padded to a multiple of so many particles: it is little work, and dear to compile.
+POPULATION = 32
 
 
 def block_size(count: int) -> int:
     """Particles of each block of a campaign of that many."""
-    most = BLOCKS[-1]
-    if count <= most:
-        return next(size for size in BLOCKS if size >= count)
-    size = -(-count // -(-count // most))
-    return size + -size % 4
+    return BLOCK if count <= MANY else MANY
 
 
 def padded(tree: Any) -> tuple[Any, np.ndarray]:
-    """Arrays of particles with copies of the last one up to whole blocks, and weights: 1 of particles, 0 of copies."""
+    """Arrays of particles with copies of the last up to one of few lengths, and weights: 1, and 0 of the copies."""
     count = len(jax.tree.leaves(tree)[0])
-    rows = np.arange(count + -count % block_size(count))
+    rows = np.arange(count + -count % (POPULATION if count <= MANY else MANY))
 
     def longer(x: Any) -> Any:
         x = x if is_traced(x) else np.asarray(x)  # of NumPy, so that nothing is compiled
-        return jnp.asarray(x[np.minimum(rows, count - 1)])
+        return jax.device_put(x[np.minimum(rows, count - 1)])
 
     return jax.tree.map(longer, tree), np.where(rows < count, 1.0, 0.0)
 
@@ -82,11 +79,11 @@ class Blocks:
         if self.number == 1 and self.size == self.count:
             return function(*particles, *shared)
         mesh = self._mesh if hasattr(function, "__wrapped__") else None
-        placed = jnp.asarray if mesh is None else lambda x: jax.device_put(x, NamedSharding(mesh, PartitionSpec(AXIS)))
+        sharding = None if mesh is None else NamedSharding(mesh, PartitionSpec(AXIS))
 
         def some(blocks: np.ndarray) -> Any:
             rows = self._rows(blocks)
-            own = jax.tree.map(lambda x: placed(np.asarray(x)[rows]) if np.ndim(x) else x, particles)
+            own = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows], sharding) if np.ndim(x) else x, particles)
             return function(*own, *shared) if mesh is None else _on_all_devices(own, shared, function, mesh)
 
         return self._gathered([some(blocks) for blocks in self._own])
@@ -113,7 +110,7 @@ class Blocks:
             leaves, structure = jax.tree.flatten(whole)
             leaves = [np.concatenate(several) for several in zip(*_exchanged(leaves), strict=True)]
             whole = jax.tree.unflatten(structure, leaves)
-        return jax.tree.map(lambda x: jnp.asarray(x[: self.count]), whole)
+        return jax.tree.map(lambda x: jax.device_put(x[: self.count]), whole)
 
 
 @compiled

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,15 +15,14 @@ from jaxtyping import Array, Float
 from .._types import Progress
 from ..calibrate.data import Selection, Tests, ranges_um, root_mean_squares
 from ..calibrate.fitting import in_own_units, prepare
-from ..calibrate.forward import Forms, Point, snap
+from ..calibrate.forward import Forms, Point
 from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.numpyro_model import Model
+from ..calibrate.particle_fit import snaps
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
-from ..calibrate.sharding import Blocks
+from ..calibrate.sharding import BLOCK, Blocks
 from ..campaign import Campaign, find_segments
 from .settings import DECISIONS
-
-BLOCK = 8  # particles that are linearised at once: one program for any number of them
 
 
 class State(eqx.Module):
@@ -87,7 +85,7 @@ class Base:
     @property
     def snaps(self) -> np.ndarray:
         """Where the law snaps through below a test's largest force: there no displacement belongs to a force."""
-        log_force = np.asarray(jax.vmap(snap)(self.state.point.latent, self.tests.particle))
+        log_force = np.asarray(snaps(self.state.point.latent, self.tests.particle))
         return log_force < np.log(np.max(np.where(self.tests.mask, self.tests.force, 1e-300), axis=1))
 
 
@@ -109,8 +107,8 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress
             most = DECISIONS.readings * branches
             selection, fit, _ = prepare(campaign, model, threshold_MPa, most_points=most, progress=progress)
     p = fit.population
-    shift = float(jnp.mean(jnp.log1p(p.a * fit.tests.flatness)))
-    population = jnp.concatenate([jnp.stack([p.a, p.log_modulus]), p.mu + shift])
+    shift = np.mean(np.log1p(np.asarray(p.a) * np.asarray(fit.tests.flatness)))
+    population = jnp.asarray(np.concatenate([[p.a, p.log_modulus], np.asarray(p.mu) + shift]))
     priors = model.chosen_priors
     spreads = priors.tau_C1, priors.tau_C3, priors.tau_C5, priors.modulus_scatter
     found = np.maximum([*np.asarray(p.tau), max(float(p.modulus_scatter), 1e-3)], 1e-4)

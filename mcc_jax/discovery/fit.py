@@ -139,7 +139,7 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
 
 def between(one: State, other: State, share: float = 0.5) -> State:
     """A share of the way from one state to another, half of it by default."""
-    return jax.tree.map(lambda x, y: (1 - share) * x + share * y, one, other)
+    return jax.tree.map(lambda x, y: jax.device_put((1 - share) * np.asarray(x) + share * np.asarray(y)), one, other)
 
 
 def at_priors(base: Base, rows: np.ndarray) -> State:
