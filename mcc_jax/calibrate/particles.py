@@ -187,7 +187,7 @@ class Drawer:
     """Draws of the particles, in blocks of so many, as arrays of NumPy with the axes (draw, particle).
 
     `chunk` draws of the population are worked on in one call, so that one compilation serves any number of them; all
-    by default. Chunks run next to each other where all particles are one block.
+    by default. Chunks run next to each other in a single process.
     """
 
     def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:

@@ -28,22 +28,22 @@ from .data import Tests
 
 AXIS = "particles"  # the only axis of the mesh of a process's devices
 
-# Particles of a block: few, so that campaigns of every size share their programs; of many particles more, since a
-# call takes time of its own (`bench_scale.py`).
-BLOCK, MANY = 8, 64
+# Particles of a block: few, so that campaigns of every size share their programs; more where there are many of them, or
+# on an accelerator, since every call takes time of its own (`bench_scale.py`).
+BLOCK, LARGE_BLOCK = 8, 64
 # What concerns the population is padded to a multiple of so many particles: it is little work, and dear to compile.
 POPULATION = 32
 
 
 def block_size(count: int) -> int:
     """Particles of each block of a campaign of that many."""
-    return BLOCK if count <= MANY else MANY
+    return BLOCK if count <= LARGE_BLOCK and jax.default_backend() == "cpu" else LARGE_BLOCK
 
 
 def padded(tree: Any) -> tuple[Any, np.ndarray]:
     """Arrays of particles with copies of the last up to one of few lengths, and weights: 1, and 0 of the copies."""
     count = len(jax.tree.leaves(tree)[0])
-    rows = np.arange(count + -count % (POPULATION if count <= MANY else MANY))
+    rows = np.arange(count + -count % (POPULATION if count <= LARGE_BLOCK else LARGE_BLOCK))
 
     def longer(x: Any) -> Any:
         x = x if is_traced(x) else np.asarray(x)  # of NumPy, so that nothing is compiled
