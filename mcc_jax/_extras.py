@@ -22,14 +22,6 @@ EXTRAS = {
 class MissingExtraError(InputError, ModuleNotFoundError):
     """Something is called for that the base installation does not bring; the message says how to get it."""
 
-    def __init__(self, extra: str, module: str, file: str | Path | None = None) -> None:
-        super().__init__(
-            f"{EXTRAS[extra][0]} the package {module}, which is not installed",
-            file=file,
-            remedy=f"Install the extra {extra!r}: python -m pip install 'mcc-jax[{extra}]'",
-        )
-        self.extra, self.name = extra, module
-
 
 @contextlib.contextmanager
 def extra(name: str, file: str | Path | None = None) -> Iterator[None]:
@@ -43,4 +35,6 @@ def extra(name: str, file: str | Path | None = None) -> Iterator[None]:
         missing = (error.name or "").partition(".")[0]
         if missing not in EXTRAS[name][1]:  # something else is broken: that is raised as it is
             raise
-        raise MissingExtraError(name, missing, file) from None
+        problem = f"{EXTRAS[name][0]} the package {missing}, which is not installed"
+        remedy = f"Install the extra {name!r}: python -m pip install 'mcc-jax[{name}]'"
+        raise MissingExtraError(problem, file=file, remedy=remedy) from None

@@ -66,14 +66,14 @@ def with_sd(estimate: Mapping[str, Any], factor: float = 1.0) -> str:
     if value is None or sd is None or not sd > 0:
         return number(None if value is None else value * factor)
     value, sd = value * factor, sd * factor
-    places = decimals(value, sd)
-    if places is not None:
-        return f"{value:.{places}f} ± {sd:.{places}f}".replace("-", "−")
-    power = math.floor(math.log10(max(abs(value), sd)))
-    places = decimals(1.0, sd / 10.0**power)
+    places, power = decimals(value, sd), 0
+    if places is None:
+        power = math.floor(math.log10(max(abs(value), sd)))
+        places = decimals(1.0, sd / 10.0**power)
     if places is None:
         return f"{number(value)} ± {number(sd, 2)}"
-    return f"({value / 10.0**power:.{places}f} ± {sd / 10.0**power:.{places}f}) × 10{_raised(power)}".replace("-", "−")
+    both = f"{value / 10.0**power:.{places}f} ± {sd / 10.0**power:.{places}f}".replace("-", "−")
+    return f"({both}) × 10{_raised(power)}" if power else both
 
 
 def interval(estimate: Mapping[str, Any], factor: float = 1.0) -> str | None:
