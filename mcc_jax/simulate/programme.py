@@ -78,8 +78,10 @@ class Programme:
         sampling = f"every {self.interval_s} s" if self.points is None else f"{self.points} samples"
         rows = []
         for i, step in enumerate(self.steps, start=1):
-            hold = f"hold {number(step.seconds)} s" if isinstance(step, Hold) else None
-            rows.append((str(i), hold or f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"))
+            if isinstance(step, Hold):
+                rows.append((str(i), f"hold {number(step.seconds)} s"))
+            else:
+                rows.append((str(i), f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"))
         return table(f"Programme under control of {self.control}, {sampling}", rows)
 
     @classmethod
