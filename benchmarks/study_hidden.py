@@ -24,7 +24,7 @@ import numpy as np
 
 import mcc_jax as mcc
 from mcc_jax.calibrate.forward import Forms, Point, linearise
-from mcc_jax.calibrate.noise import Noise, effects_grams
+from mcc_jax.calibrate.noise import Noise, grams_and_likelihoods
 from mcc_jax.effects import find_variant
 
 RESULTS = Path(__file__).parent / "results"
@@ -52,7 +52,8 @@ def strength(base: mcc.calibrate.Fit, name: str, strong: str) -> float:
     point = Point(base.point.latent, base.point.zero, jnp.asarray(np.broadcast_to(theta, (PARTICLES, len(theta)))))
     linear, model = linearise(point, base.tests, forms), base.model
     kinds = model.zero_prior[1], model.correlation, model.along
-    information = float(np.asarray(effects_grams(base.tests, linear, true, *kinds))[:, 0, 0].sum())
+    grams, _ = grams_and_likelihoods(true.scale, base.tests, linear, true.logs[None], *kinds)
+    information = float(np.asarray(grams)[:, 0, 0, 0].sum())
     points = int(np.asarray(base.tests.mask).sum())
     squares = WEAK**2 if strong == "weak" else (float(strong) - 1) * points
     return float(np.sqrt(squares / information))

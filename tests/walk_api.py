@@ -49,7 +49,7 @@ def examples(folder: Path) -> list[Example]:
     curve = mcc.Curve(np.linspace(0.0, 7.0, 8), np.linspace(0.0, 80.0, 8), np.asarray(force))
     tests = mcc.paper_campaign(0).select(np.arange(20) < 3)
     adjustment = mcc.adjust(tests)
-    table = calibrate.strain_table(adjustment, tests.diameters_um, 50)
+    table = calibrate.strain_table(adjustment, tests.diameters_um)
     sizes, peaks = tests.diameters_um, np.array([400.0, 300.0, 350.0])
     laws = jax.vmap(lambda _: the_law)(np.arange(3.0))
     programme = mcc.Programme.cycles()
@@ -83,7 +83,7 @@ def examples(folder: Path) -> list[Example]:
         Example(mcc.campaign.Segment, kind="load", start=0, stop=4),
         Example(mcc.campaign.find_segments, curve=tests.curves[0], control="load"),
         Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
-        Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
+        Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes),
         Example(calibrate.fit_shape_parameter, table=table, objective="full"),
         Example(mcc.Model, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False),
         Example(mcc.calibrate.LogNormalPrior, median=6.0, log_sd=0.5),

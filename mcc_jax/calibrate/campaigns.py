@@ -6,7 +6,6 @@ import inspect
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,17 +51,11 @@ def fit(
 
 @dataclass(frozen=True)
 class Evidence:
-    """The log marginal likelihood of a model: how probable the tests are under it, all its parameters integrated out.
+    """The log marginal likelihood of a model: of the tests under it, all its parameters integrated out."""
 
-    Attributes:
-        value: natural logarithm.
-        error: its standard error; infinite where it is Laplace's approximation alone.
-        pareto_k: of the importance weights behind it; above 0.7 they are unreliable.
-    """
-
-    value: float
-    error: float
-    pareto_k: float
+    value: float  # natural logarithm
+    error: float  # its standard error; infinite where it is Laplace's approximation alone
+    pareto_k: float  # of the importance weights behind it; above 0.7 they are unreliable
 
     __repr__ = described()
 
@@ -83,14 +76,12 @@ def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, 
 
 
 def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: int = 0) -> pd.DataFrame:
-    """Models of one campaign side by side, one row each.
+    """Models of one campaign, or posteriors that were sampled of it, side by side, one row each.
 
     Columns: `log_evidence` and its error, `elpd` (expected log predictive density of a particle left out, by
     Pareto-smoothed importance sampling) and its standard error, `elpd_difference` to the best and its error,
     `chi2_per_point` (measured less predicted in standard deviations of the noise of the first model), `rms_um`,
     `noise_share`, `converged`.
-
-    `models` are models, or posteriors of this campaign that were sampled.
 
     Raises:
         InputError: for no model, one with robust noise, or posteriors whose tests are not the same.
@@ -157,7 +148,7 @@ def calibrate_many(
     progress: Callable[[int, str], None] | None = None,
     **settings: Any,
 ) -> list[Posterior | LeastSquares | Exception]:
-    """Calibrate many campaigns, one after another.
+    """Calibrate many campaigns, one after another; in place of one that fails stands its exception.
 
     Campaigns of similar size share one compilation: every calibration pads its campaign to one of few sizes, with
     copies of a particle that count for nothing and with masked points. So every result is that of `sample` or
@@ -168,28 +159,19 @@ def calibrate_many(
         method: "bayes" or "least-squares".
         threshold_MPa: points below this stress on loading do not count [MPa].
         progress: called with a campaign's position and the name of its step, "done" or "failed" last.
-        settings: of `sample` or `least_squares`: model, seed, chains, loss, ...
-
-    Returns:
-        Results in the order of the campaigns; in place of one that fails, its exception.
-
-    Raises:
-        InputError: if the method is unknown.
-        TypeError: for settings that the method does not have.
+        settings: of `sample` or `least_squares`: model, seed, chains, loss, ...; others raise a `TypeError`.
     """
     methods: dict[str, Callable[..., Posterior | LeastSquares]] = {"bayes": sample, "least-squares": least_squares}
     calibrate = methods[arguments.choice(method, methods, "method")]
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    if isinstance(campaigns, str | Path | Campaign) or not isinstance(campaigns, Iterable):
-        raise InputError(f"campaigns must be a list of campaigns, got {arguments.kind_of(campaigns)}")
     inspect.signature(calibrate).bind(None, threshold_MPa=threshold_MPa, progress=None, **settings)
     found: list[Posterior | LeastSquares | Exception] = []
     progress = progress or (lambda _, __: None)
     for i, campaign in enumerate(campaigns):
+        step = partial(progress, i)
         try:
-            step = partial(progress, i)
             found.append(calibrate(campaign, threshold_MPa=threshold_MPa, progress=step, **settings))
         except Exception as error:  # whatever it is, it takes its campaign's place
             found.append(error)
-        progress(i, "failed" if isinstance(found[i], Exception) else "done")
+        step("failed" if isinstance(found[i], Exception) else "done")
     return found

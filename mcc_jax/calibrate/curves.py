@@ -1,27 +1,126 @@
-"""Every test of a campaign next to its calibrated law: what report and figures show, worked out once."""
+"""What follows from the contents of a `calibration.json`: laws, and every test of a campaign next to its law."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._format import described
+from .._errors import InputError
+from .._format import described, first_few
 from ..campaign import Campaign, Segment, campaign_segments, particle_batch
-from ..effects import Record
+from ..effects import AbstractEffect, Record, Variant
 from ..geometry import Particle
-from ..law import MccLaw
+from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 from .compiling import compiled
-from .data import MOST_POINTS, padded_length, records_of, rows_from_contact
-from .estimates import Variants, laws_of
+from .data import MOST_POINTS, padded_length, records_of, row_kinds, rows_from_contact
 from .population import COEFFICIENTS
 from .sharding import Blocks
 
 KINDS = ("load", "hold", "unload", "reload")
+RIGID_MPA = 1e9  # where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined
+
+
+# ---- laws ------------------------------------------------------------------------------------------------------------
+
+Variants = Mapping[str, Variant]
+"""The formulas of a law's effects, by "mechanism:variant"."""
+
+
+def law_of(
+    content: Mapping[str, Any],
+    particle: str | None = None,
+    diameters_um: np.ndarray | None = None,
+    variants: Variants | None = None,
+) -> MccLaw:
+    """The law that a `calibration.json` describes, of the median particle or of one of these diameters [um].
+
+    Raises:
+        InputError: for a particle that took no part, or a parameter without a value.
+    """
+    entry = None if particle is None else entry_of(content, particle)
+    if entry is None:
+        C = [math.exp(_number(content[f"log_{name}"]["mean"], f"log_{name}")) for name in COEFFICIENTS]
+    else:
+        C = [_number(entry[name], name) for name in COEFFICIENTS]
+    for name in ("a", "effective_modulus_MPa"):
+        _number(content[name], name)
+    return _law(content, C, entry, diameters_um, variants)
+
+
+def _typical_coefficients(content: Mapping[str, Any]) -> list[float]:
+    """The medians of C1, C3 and C5; of the paper's method those of the law of the expected stress."""
+    logs = [content[f"log_{name}"] for name in COEFFICIENTS]
+    if any(log["mean"]["value"] is None for log in logs):
+        return [math.nan] * 3
+    population = PlasticPopulation(*(LogNormal(log["mean"]["value"], log["sd"]["value"] or 0.0) for log in logs))
+    law = population.mean_law if content["method"] == "paper" else population.median_law
+    return [float(law.C1), float(law.C3), float(law.C5)]
+
+
+def _law(
+    content: Mapping[str, Any],
+    C: Any,
+    entry: Mapping[str, Any] | None,
+    size: np.ndarray | None,
+    variants: Variants | None,
+) -> MccLaw:
+    """The law with these coefficients, and with what differs between particles in the entry of one."""
+    a = content["a"]["value"] or 0.0
+    modulus: Any = content["effective_modulus_MPa"]["value"] or RIGID_MPA
+    amplitudes: Mapping[str, Any] = {}
+    if entry is not None:
+        modulus = (entry.get("effective_modulus_MPa") or {}).get("value") or modulus
+        amplitudes = entry.get("amplitudes") or {}
+        eta = entry["eta_p"]["value"]
+        if content.get("shape_scatter") is not None and eta is not None and size is not None:
+            flatness = 1 - size[2] ** 2 / (size[0] * size[1])  # eta_p = 1 + a (1 - D3^2/(D1 D2))
+            a = a if abs(flatness) < 1e-6 else (eta - 1) / flatness
+
+    def effect(one: Mapping[str, Any]) -> AbstractEffect:
+        variant = (variants or {})[f"{one['mechanism']}:{one['variant']}"]
+        values = {key: parameter["value"] for key, parameter in one["parameters"].items()}
+        strength = values.pop(variant.parameter)
+        own = amplitudes.get(one["mechanism"])
+        return variant.build(strength if own is None else own["value"], **values)
+
+    form = Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
+    return MccLaw(Plastic(*C), a, modulus, *form, effects=tuple(map(effect, content.get("effects", ()))))
+
+
+def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
+    """What the contents of a `calibration.json` say of one particle.
+
+    Raises:
+        InputError: if it is not there or took no part, naming those that did.
+    """
+    entries = {str(entry["particle"]): entry for entry in content["particles"]}
+    if particle not in entries:
+        raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {first_few(entries, 12)}.")
+    if not entries[particle]["kept"]:
+        raise InputError(
+            f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}",
+            remedy="Take another particle or, without one, the population.",
+        )
+    return entries[particle]
+
+
+def _number(estimate: Mapping[str, Any], name: str) -> float:
+    value = estimate["value"]
+    if value is None and name == "effective_modulus_MPa":
+        raise InputError("holds no effective modulus", remedy="Calibrate on tests that unload.")
+    if value is None or (name.startswith("log_") and abs(value) > 100):
+        raise InputError(f"{name} has no sensible value", remedy="Calibrate again on tests that determine it.")
+    return float(value)
+
+
+# ---- curves ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -63,10 +162,7 @@ class FittedCurve:
 
 def measured_curves(campaign: Campaign) -> tuple[FittedCurve, ...]:
     """The tests of a campaign that nobody calibrated."""
-    return tuple(
-        _measured(campaign, i, parts, *_all_rows(campaign, i, parts))
-        for i, parts in enumerate(campaign_segments(campaign))
-    )
+    return tuple(_measured(campaign, campaign_segments(campaign), {})[0])
 
 
 def fitted_curves(
@@ -82,54 +178,66 @@ def fitted_curves(
     `predictions` gives draws of what may be measured of a particle at its rows [um].
     """
     segments = campaign_segments(campaign)
-    entries = {entry["particle"]: entry for entry in content["particles"]}
-    chosen = [compared.get(i) or _all_rows(campaign, i, parts) for i, parts in enumerate(segments)]
-    curves = [_measured(campaign, i, parts, *chosen[i]) for i, parts in enumerate(segments)]
-    curves = [replace(one, why_not=entries[one.name]["why_not"]) for one in curves]
-    known = {n: e["kept"] and all(e[c]["value"] is not None for c in COEFFICIENTS) for n, e in entries.items()}
-    rows = [i for i, one in enumerate(curves) if known[one.name]]
-    if not rows:
+    curves, rows = _measured(campaign, segments, compared)
+    entry_by_name = {entry["particle"]: entry for entry in content["particles"]}
+    entries = [entry_by_name[name] for name in campaign.particles]
+    curves = [replace(one, why_not=entry["why_not"]) for one, entry in zip(curves, entries, strict=True)]
+    C = [[entry[name]["value"] for name in COEFFICIENTS] for entry in entries]
+    places = [i for i, entry in enumerate(entries) if entry["kept"] and None not in C[i]]
+    if not places:
         return tuple(curves)
-    # Campaigns of similar size and length share one compilation.
-    longest = padded_length(max(len(chosen[i][0]) for i in rows))
-    record, _, _ = records_of(campaign, rows, segments, [chosen[i][0] for i in rows], longest)
-    sizes = campaign.diameters_um[rows]
-    both = laws_of(content, [curves[i].name for i in rows], sizes, variants)
-    blocks = Blocks(len(rows))
-    own, typical = (np.asarray(blocks.all(responses, (laws, particle_batch(sizes), record))) for laws in both)
-    for row, own_um, typical_um in zip(rows, own, typical, strict=True):
-        one, zero = curves[row], entries[curves[row].name]["zero_um"]["value"] or 0.0
+    own = [_law(content, C[i], entries[i], campaign.diameters_um[i], variants) for i in places]
+    typical = [_law(content, _typical_coefficients(content), None, None, variants)] * len(places)
+    laws = (jax.tree.map(lambda *x: jnp.asarray(np.stack(x, dtype=float)), *each) for each in (own, typical))
+    both = responses_um(campaign, places, segments, [rows[i] for i in places], *laws)
+    for i, own_um, typical_um in zip(places, *both, strict=True):
+        one, zero = curves[i], entries[i]["zero_um"]["value"] or 0.0
         length = len(one.kind)
         one = replace(one, own_um=own_um[:length] + zero, typical_um=typical_um[:length] + zero)
-        draws = predictions(one.name) if row in compared else None
+        draws = predictions(one.name) if i in compared else None
         if draws is not None:
             # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
             centre, half = draws.mean(0), 1.96 * draws.std(0)
             low, high = (np.where(one.used, centre + sign * half, np.nan) for sign in (-1, 1))
             # Means of coefficients are not the coefficients of the mean.
             one = replace(one, own_um=np.where(one.used, centre, one.own_um), low_um=low, high_um=high)
-        curves[row] = one
+        curves[i] = one
     return tuple(curves)
 
 
-def _all_rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """All rows of a test from contact on, thinned, all of them compared."""
-    rows = rows_from_contact(campaign.curves[i], segments, MOST_POINTS)
-    return rows, np.ones(len(rows), bool)
-
-
 def _measured(
-    campaign: Campaign, i: int, segments: tuple[Segment, ...], rows: np.ndarray, used: np.ndarray
-) -> FittedCurve:
-    curve, nothing = campaign.curves[i], np.full(len(rows), np.nan)
-    kind = np.zeros(len(curve), int)
-    for part in segments:
-        kind[part.start : part.stop] = KINDS.index(part.kind) if part.kind in KINDS else 0
-    measured = curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows]
-    return FittedCurve(campaign.particles[i], None, *measured, kind[rows], used, nothing, nothing, nothing, nothing)
+    campaign: Campaign,
+    segments: Sequence[tuple[Segment, ...]],
+    compared: Mapping[int, tuple[np.ndarray, np.ndarray]],
+) -> tuple[list[FittedCurve], list[np.ndarray]]:
+    """All tests without a law, and their rows: those that were compared, else all from contact on, thinned."""
+    found, all_rows = [], []
+    for i, (name, curve) in enumerate(zip(campaign.particles, campaign.curves, strict=True)):
+        rows = compared[i][0] if i in compared else rows_from_contact(curve, segments[i], MOST_POINTS)
+        used = compared[i][1] if i in compared else np.ones(len(rows), bool)
+        kind = np.argmax(row_kinds(segments[i])[rows, None] == np.array(KINDS), axis=1)
+        measured = curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows]
+        found.append(FittedCurve(name, None, *measured, kind, used, *[np.full(len(rows), np.nan)] * 4))
+        all_rows.append(rows)
+    return found, all_rows
 
 
 @compiled
 def responses(laws: MccLaw, particles: Particle, records: Record) -> Array:
     """Displacement [um] of particles by a law each, along a record each, shape (N, points)."""
     return jax.vmap(lambda law, *one: law.respond(*one))(laws, particles, records)
+
+
+def responses_um(
+    campaign: Campaign,
+    places: list[int],
+    segments: Sequence[tuple[Segment, ...]],
+    rows: Sequence[np.ndarray],
+    *laws: MccLaw,
+) -> list[np.ndarray]:
+    """Displacement [um] of tests at some places of a campaign, at some rows of each, shape (N, points), by each of the
+    laws, whose arrays have the particles first."""
+    # Campaigns of similar size and length share one compilation.
+    record, _, _ = records_of(campaign, places, segments, rows, padded_length(max(map(len, rows))))
+    sizes, blocks = particle_batch(campaign.diameters_um[places]), Blocks(len(places))
+    return [np.asarray(blocks.all(responses, (one, sizes, record))) for one in laws]

@@ -27,6 +27,7 @@ from ..campaign import (
     turning_forces,
 )
 from ..campaign.adjustment import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ..campaign.findings import named
 from ..campaign.record import humidities, record_columns
 from ..campaign.segments import contact_index
 from ..campaign.signal import point_noise
@@ -50,40 +51,30 @@ LENGTHS = (64, 192, 448)
 
 
 class Tests(eqx.Module):
-    """N tests as rectangular arrays; shorter ones are padded with their last point, which is masked.
-
-    Attributes:
-        particle: sizes and shapes, leading axis N.
-        record: what the instrument did, point by point; its forces are those of `turning_forces`.
-        displacement: measured displacement [um], raw; None to predict it.
-        mask: which points are compared with the law.
-        loading: which of them lie on virgin loading.
-        contact: displacement at which the record says that the platen touches [um].
-        path: where a point is on its path of force: the sum of all changes of force up to it, in shares of the
-            largest force [-]. Correlated residuals live along it.
-        branch: index of the point from which a point's branch starts; its own on virgin loading.
-        reading: whether a point's force is a reading of its own.
-        peak_error: standard error of the force from which its branch starts, in those of a reading [-].
-        force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
-        peak_sd: standard deviation of the force of each point's branch peak where it was worked out otherwise, from
-            readings that saturate [mN]; None where none was.
-        reading_weight: by how much the white noise of a point is less in variance [-]; None where all are alike.
-    """
+    """N tests as rectangular arrays; shorter ones are padded with their last point, which is masked."""
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
 
-    particle: Particle
-    record: Record
-    displacement: Float[Array, "particles points"] | None
-    mask: Bool[Array, "particles points"]
-    loading: Bool[Array, "particles points"]
-    contact: Float[Array, " particles"]
+    particle: Particle  # sizes and shapes, leading axis N
+    record: Record  # what the instrument did, point by point; its forces are those of `turning_forces`
+    displacement: Float[Array, "particles points"] | None  # measured displacement [um], raw; None to predict it
+    mask: Bool[Array, "particles points"]  # which points are compared with the law
+    loading: Bool[Array, "particles points"]  # which of them lie on virgin loading
+    contact: Float[Array, " particles"]  # displacement at which the record says that the platen touches [um]
+    # where a point is on its path of force: the sum of all changes of force up to it, in shares of the largest force
+    # [-]. Correlated residuals live along it
     path: Float[Array, "particles points"]
+    # index of the point from which a point's branch starts; its own on virgin loading
     branch: Int[Array, "particles points"]
-    reading: Bool[Array, "particles points"]
+    reading: Bool[Array, "particles points"]  # whether a point's force is a reading of its own
+    # standard error of the force from which its branch starts, in those of a reading [-]
     peak_error: Float[Array, "particles points"]
+    # standard deviation of each test's zero of force [mN]; None where none was measured
     force_zero_sd: Float[Array, " particles"] | None = None
+    # standard deviation of the force of each point's branch peak where it was worked out otherwise, from readings that
+    # saturate [mN]; None where none was
     peak_sd: Float[Array, "particles points"] | None = None
+    # by how much the white noise of a point is less in variance [-]; None where all are alike
     reading_weight: Float[Array, "particles points"] | None = None
 
     __repr__ = described(displacement="um", contact="um")
@@ -118,21 +109,14 @@ def padded_length(points: int) -> int:
 
 @dataclass(frozen=True)
 class Selection:
-    """Which particles take part, and which points of each.
+    """Which particles take part, and which points of each."""
 
-    Attributes:
-        tests: the arrays of those that do.
-        kept: their positions in the campaign.
-        reasons: for each particle of the campaign, None if kept, else why it is not.
-        rows: for each kept particle, the rows of its curve, as `check_tests` left it, that are in `tests`.
-        notes: what a reader must know about particles that are kept.
-    """
-
-    tests: Tests
-    kept: tuple[int, ...]
-    reasons: tuple[Finding | None, ...]
+    tests: Tests  # the arrays of those that do
+    kept: tuple[int, ...]  # their positions in the campaign
+    reasons: tuple[Finding | None, ...]  # for each particle of the campaign, None if kept, else why it is not
+    # for each kept particle, the rows of its curve, as `check_tests` left it, that are in `tests`
     rows: tuple[np.ndarray, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what a reader must know about particles that are kept
 
     @property
     def why_not(self) -> tuple[str | None, ...]:
@@ -161,15 +145,12 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
             'call jax.config.update("jax_enable_x64", True) before anything else'
         )
     segments = campaign_segments(campaign)
-    prepared = [
-        _prepare(curve, diameters, parts, threshold_MPa, most_points)
-        for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
-    ]
-    usable = {i: one for i, one in enumerate(prepared) if not isinstance(one, Finding)}
-    apart = far_apart({i: (one.stress_max_MPa, one.strain_range) for i, one in usable.items()})
-    prepared = [apart.get(i, one) for i, one in enumerate(prepared)]
-    reasons = tuple(one if isinstance(one, Finding) else None for one in prepared)
-    used = {i: one for i, one in enumerate(prepared) if not isinstance(one, Finding)}
+    tests = zip(campaign.curves, campaign.diameters_um, segments, strict=True)
+    prepared = dict(enumerate(_prepare(*test, threshold_MPa, most_points) for test in tests))
+    ends = {i: (one.stress_max_MPa, one.strain_range) for i, one in prepared.items() if isinstance(one, _Prepared)}
+    prepared |= far_apart(ends)
+    reasons = tuple(one if isinstance(one, Finding) else None for one in prepared.values())
+    used = {i: one for i, one in prepared.items() if isinstance(one, _Prepared)}
     if not used:
         raise refusal(campaign, "no particle can be used", reasons)
     kept, rows = tuple(used), tuple(one.rows for one in used.values())
@@ -198,23 +179,15 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
     return Selection(tests, kept, reasons, rows, tuple(_notes(campaign, used, most_points)))
 
 
-def compared_rows(selection: Selection) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Rows of every kept particle's curve, and which of them are compared, by its place in the campaign."""
-    mask = np.asarray(selection.tests.mask)
-    both = zip(selection.kept, selection.rows, mask, strict=True)
-    return {place: (rows, used[: len(rows)]) for place, rows, used in both}
-
-
 def _errors_of_force(
     curves: Sequence[Curve], rows: Sequence[np.ndarray], branch: np.ndarray
 ) -> tuple[Array | None, Array | None]:
     """Errors of the zeros of force, and of the peaks of branches that were worked out; None where there are none."""
-    checked = [c.checked for c in curves]
-    zero = np.array([0.0 if one is None else one.force_zero_sd_mN for one in checked])
-    peak = np.zeros(branch.shape)
-    for k, one in enumerate(checked):
-        if one is not None:
-            peak[k, : len(rows[k])] = one.force_sd_mN[rows[k]]
+    zero, peak = np.zeros(len(curves)), np.zeros(branch.shape)
+    for k, curve in enumerate(curves):
+        if curve.checked is not None:
+            zero[k] = curve.checked.force_zero_sd_mN
+            peak[k, : len(rows[k])] = curve.checked.force_sd_mN[rows[k]]
     # A branch starts at its peak or one reading behind it.
     peak = np.maximum(*(np.take_along_axis(peak, np.maximum(branch - back, 0), axis=1) for back in (0, 1)))
     return (jnp.asarray(zero) if zero.any() else None), (jnp.asarray(peak) if peak.any() else None)
@@ -222,8 +195,8 @@ def _errors_of_force(
 
 def _branches(levels: np.ndarray, elastic: np.ndarray) -> np.ndarray:
     """Index of the first point of every branch: points that start from one peak share it, loading has its own."""
-    same = np.concatenate([np.zeros_like(elastic[:, :1]), elastic[:, 1:] & elastic[:, :-1]], 1)
-    same[:, 1:] &= levels[:, 1:] == levels[:, :-1]
+    same = np.zeros_like(elastic)
+    same[:, 1:] = elastic[:, 1:] & elastic[:, :-1] & (levels[:, 1:] == levels[:, :-1])
     return np.maximum.accumulate(np.where(same, 0, np.arange(levels.shape[1])), axis=1)
 
 
@@ -277,21 +250,23 @@ def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: 
     parts, thinned = segments, [rows[:: -(-len(rows) // most_points)]]
     turns = [int(np.argmax(curve.force_mN))]
     if len(segments) > most_parts:
+        kind, force = row_kinds(segments), np.asarray(curve.force_mN)
         elastic = [part for part in segments if part.kind in ("hold", "unload", "reload")]
         parts = tuple(elastic[:: -(-len(elastic) // most_parts)])
-        force = np.asarray(curve.force_mN)
         # The largest force before each, from which the law unloads.
         highest = np.maximum.accumulate(np.where(force >= np.maximum.accumulate(force), np.arange(len(force)), 0))
         turns += [int(highest[part.start]) for part in parts]
-        virgin, kept = (
-            np.concatenate([np.arange(0), *(np.arange(part.start, part.stop) for part in several)])
-            for several in ([part for part in segments if part.kind == "load"], parts)
-        )
+        kept = np.concatenate([np.arange(part.start, part.stop) for part in parts])
         # Half of the rows for each: the one loading of many cycles is short.
-        shares = virgin[virgin >= start], np.setdiff1d(kept[kept >= start], virgin)
+        shares = rows[kind[rows] == "load"], kept[kept >= start]
         thinned = [some[:: -(-len(some) * 2 // most_points) or 1] for some in shares]
     turns += [part.start for part in parts] + [part.stop - 1 for part in parts]
     return np.unique(np.concatenate([*thinned, [t for t in turns if t >= start]]).astype(int))
+
+
+def row_kinds(segments: tuple[Segment, ...]) -> np.ndarray:
+    """The kind of segment of every row of a test."""
+    return np.repeat([part.kind for part in segments], [len(part) for part in segments])
 
 
 def _prepare(
@@ -299,36 +274,29 @@ def _prepare(
 ) -> _Prepared | Finding:
     """The rows of one test that are used, or why there are none."""
     stress, strain = stress_and_strain(curve, diameters, segments)
-    kind = np.empty(len(curve), dtype="<U8")
-    for part in segments:
-        kind[part.start : part.stop] = part.kind
+    kind = row_kinds(segments)
     if not (kind == "load").any():
         return no_loading(curve, segments, stress, threshold)
     rows = rows_from_contact(curve, segments, most_points)
-    peak = np.maximum.accumulate(stress[rows])
-    loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
-    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= UNLOADED_FROM * peak)
-    mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
-    hidden = bool((mask & ~loading).any())
-    mask, loading = mask & curve.compared[rows], loading & curve.compared[rows]
-    hidden &= not (mask & ~loading).any()
+    kind, at, compared = kind[rows], stress[rows], curve.compared[rows]
+    peak = np.maximum.accumulate(at)
+    loading = (kind == "load") & (at >= threshold) & (at > 0)
+    elastic = np.isin(kind, ("hold", "unload", "reload")) & (at >= threshold) & (at >= UNLOADED_FROM * peak)
+    elastic &= peak > 0
+    hidden = bool(elastic.any() and not elastic[compared].any())
+    loading, elastic = loading & compared, elastic & compared
     if stress.max() <= threshold:
         return below_threshold(float(stress.max()), threshold)
     if loading.sum() < LEAST_POINTS:
         return too_few(int(loading.sum()), LEAST_POINTS)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
-    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
-    if rise <= CLIMB * noise / np.sqrt(third):
-        return no_climb(float(rise) if rise >= 0 or -rise > CLIMB * noise / np.sqrt(third) else 0.0)
-    contact = float(curve.displacement_um[contact_index(segments)])
-    largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
-    return _Prepared(rows, mask, loading, contact, largest, reach, hidden)
-
-
-def point_noise_um(curve: Curve) -> float:
-    """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
-    return point_noise(curve.displacement_um)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise(curve.displacement_um), READING_UM)
+    least = CLIMB * noise / np.sqrt(third)
+    if rise <= least:
+        return no_climb(float(rise) if rise >= 0 or rise < -least else 0.0)
+    contact, mask = float(curve.displacement_um[contact_index(segments)]), loading | elastic
+    return _Prepared(rows, mask, loading, contact, float(at[mask].max()), float(np.ptp(strain[rows][mask])), hidden)
 
 
 def ranges_um(tests: Tests) -> np.ndarray:
@@ -348,13 +316,10 @@ def _notes(campaign: Campaign, used: Mapping[int, _Prepared], most_points: int) 
     if any(len(campaign.curves[i]) > most_points for i in used):
         yield f"{thinned} records were thinned to about {most_points} rows"
     silent = [(repr(campaign.particles[i]), one) for i, one in used.items() if not (one.mask & ~one.loading).any()]
-    for hidden, what in ((False, "never unloaded"), (True, "without unloading that can be compared with the law")):
-        names = [name for name, one in silent if one.unloading_hidden is hidden]
-        more = f", ... ({len(names)} of {len(used)})" if len(names) > SHOWN else ""
-        if len(names) == 1:
-            yield f"particle {names[0]} is {what}: it says nothing about the modulus"
-        elif names:
-            yield f"particles {', '.join(names[:SHOWN])}{more} are {what}: they say nothing about the modulus"
+    for hidden, what in ((False, "never unloaded"), (True, "no unloading that can be compared with the law")):
+        names = tuple(name for name, one in silent if one.unloading_hidden is hidden)
+        if names:
+            yield f"{named(names, len(used), SHOWN)}: {what}, so no information on the modulus"
     seen: dict[bytes, str] = {}
     for i in used:
         curve, name = campaign.curves[i], campaign.particles[i]

@@ -14,8 +14,9 @@ from .. import arguments
 from .._errors import InputError
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
+from ..campaign.signal import point_noise
 from .compiling import compiled, make_room
-from .data import MOST_POINTS, Selection, Tests, point_noise_um, select
+from .data import MOST_POINTS, Selection, Tests, select
 from .draws import Fit
 from .forward import Linear, Point, linearise
 from .linearisation import Linearisation
@@ -24,9 +25,8 @@ from .mode import LogPosterior, careful_enough, expect, log_densities, most_prob
 from .noise import (
     Noise,
     NoiseFit,
-    effects_grams,
     estimate_noise,
-    likelihoods,
+    grams_and_likelihoods,
     particle_scales,
     squared_innovations,
     student_weights,
@@ -35,7 +35,7 @@ from .numpyro_model import Model
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .population import Population
 from .priors import Priors, SpreadCoordinate, check_prior_of_a, population_sites
-from .sharding import Blocks, block_size, require_same
+from .sharding import Blocks, require_same
 
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
 ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is allowed around the prior's centre
@@ -65,11 +65,12 @@ def prepare(
     start: Start | None = None,
     progress: Progress = lambda _: None,
     **settings: Any,
-) -> tuple[Selection, Fit, int]:
-    """What was selected, its fit, and the size of a block of particles: what every calibration begins with.
+) -> tuple[Selection, Fit]:
+    """What was selected, and its fit: what every calibration begins with.
 
     The model's priors become the campaign's own where they have to (`in_own_units`). Settings are those of `fit_tests`.
-    Raises `InputError` if no particle can be used, numbers overflow, or processes were given different tests.
+    Raises `InputError` if no particle can be used, or processes were given different tests; call it within
+    `numbers_in_reach`.
     """
     make_room()
     model, note = in_own_units(campaign, model)
@@ -77,17 +78,16 @@ def prepare(
     selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
     selection = selection if note is None else replace(selection, notes=(*selection.notes, note))
     require_same(selection.tests)
-    size = block_size(len(selection.tests))
     if start is not None and start.point.theta.shape != (len(selection.kept), len(model.forms.names)):
         raise InputError(
             "start is of other particles or effects", remedy="Give the fit of the same campaign and the same model."
         )
-    read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    found = fit_tests(selection.tests, model, read_out, block=size, start=start, progress=progress, **settings)
+    read_out = float(np.median([point_noise(campaign.curves[i].displacement_um) for i in selection.kept]))
+    found = fit_tests(selection.tests, model, read_out, start=start, progress=progress, **settings)
     parts = (found.point.latent, found.point.zero, found.mode, found.covariance)
     if not all(np.isfinite(np.asarray(part)).all() for part in parts):
-        raise beyond_numbers(campaign, selection)
-    return selection, found, size
+        raise FloatingPointError("the fit ends in no numbers")
+    return selection, found
 
 
 def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
@@ -97,30 +97,9 @@ def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
     if material is None:
         return model, None
     priors = Priors.of_scale(material.stress_MPa, material.strain, model.unloading)
-    return replace(model, priors=priors), OWN_UNITS.format(material.stress_MPa, material.strain)
-
-
-OWN_UNITS = (
-    "Priors are in this campaign's own units, {:.3g} MPa at a scaled strain of {:.2g}, not in those of "
-    "microcrystalline cellulose"
-)
-
-
-def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
-    """The error of tests whose fit ends in no numbers, with the ranges that it was asked to describe."""
-    tests = selection.tests
-    size = np.asarray(tests.effective_diameter)[:, None]
-    stress = 1e3 * np.asarray(tests.force) / (np.pi * size**2 / 4)
-    strain = np.abs(np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]) / size
-    top, deepest = (np.where(np.asarray(tests.mask), x, 0.0).max(1) for x in (stress, strain))
-    most, deep = int(np.argmax(top)), int(np.argmax(deepest))
-    names = [repr(campaign.particles[i]) for i in selection.kept]
-    return InputError(
-        "the law cannot be fitted to these tests: their numbers overflow; the largest stress is "
-        f"{top[most]:.3g} MPa (particle {names[most]}), the largest displacement {deepest[deep]:.3g} times the size "
-        f"(particle {names[deep]})",
-        file=campaign.source or None,
-        remedy="Check the units of force, displacement and diameters, or leave that particle out.",
+    return replace(model, priors=priors), (
+        f"Priors are in this campaign's own units, {material.stress_MPa:.3g} MPa at a scaled strain of "
+        f"{material.strain:.2g}, not in those of microcrystalline cellulose"
     )
 
 
@@ -130,17 +109,17 @@ class _Fitter:
     `weighted` are the tests with the weights of readings that inference takes.
     """
 
-    def __init__(self, tests: Tests, model: Model, blocks: Blocks, progress: Progress) -> None:
+    def __init__(self, tests: Tests, model: Model, progress: Progress) -> None:
         if model.robust:
             tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
-        self.model, self.blocks, self.progress = model, blocks, progress
+        self.model, self.blocks, self.progress = model, Blocks(len(tests)), progress
         self.tests = self.weighted = tests
-        self.linearisation = Linearisation(tests, model.forms, model.scatter.positive, blocks)
+        self.linearisation = Linearisation(tests, model.forms, model.scatter.positive, self.blocks)
         self.varying = [k for k, _ in model.scatter.varying]
 
     def begin_at(self, start: Start) -> dict[str, float]:
         """Particles and noise of another fit, and its values of the model's sites."""
-        point, self.noise = start.point, NoiseFit.unsure(start.noise, converged=True)
+        point, self.noise = start.point, NoiseFit(start.noise, converged=True)
         own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, self.varying]])
         white = np.exp(np.asarray(start.noise.logs)[0]) * np.asarray(start.noise.scale)
         self.individual = self.alone(white, point.theta, own[:, None])
@@ -155,7 +134,7 @@ class _Fitter:
         theta = np.broadcast_to(model.forms.without_effects, (N, len(model.forms.names)))
         self.individual = self.alone(np.full(N, read_out_um), theta)
         noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
-        self.noise = NoiseFit.unsure(noise, converged=True)
+        self.noise = NoiseFit(noise, converged=True)
         theta = np.zeros(0)
         if model.effects:
             theta = start_of_effects(self.individual.point, self.tests, noise, model, self.blocks)
@@ -214,7 +193,7 @@ class _Fitter:
         shared = m.zero_prior[1], m.correlation, m.along
 
         def log_likelihoods(logs: Array) -> Array:
-            return blocks.all(likelihoods, given, logs, *shared)
+            return blocks.all(grams_and_likelihoods, given, logs, *shared)[1]
 
         self.noise = estimate_noise(log_likelihoods, m.chosen_priors.noise, old, uncertainty=uncertainty)
 
@@ -237,12 +216,12 @@ class _Fitter:
 
     def alone(self, white: np.ndarray, theta: Any, starts: np.ndarray | None = None) -> ParticleFits:
         """Every particle on its own, the effects' numbers held."""
-        priors, N, more = self.model.chosen_priors, len(self.tests), len(self.varying)
-        middle = _centre(priors)
-        centre = np.column_stack([np.broadcast_to(middle, (N, 4)), self.zero_mean, np.asarray(theta)[:, self.varying]])
-        width = np.broadcast_to([ALONE] * 4 + [priors.zero_um.sd] + [1e-12] * more, centre.shape)
+        varying, middle = np.asarray(theta)[:, self.varying], _centre(self.model.chosen_priors)
+        centre = np.column_stack([np.tile(middle, (len(varying), 1)), self.zero_mean, varying])
+        zero_sd = self.model.chosen_priors.zero_um.sd
+        width = np.broadcast_to([ALONE] * 4 + [zero_sd] + [1e-12] * len(self.varying), centre.shape)
         if starts is None:
-            starts = np.pad(linear_starts(self.tests, middle[3]), ((0, 0), (0, 0), (0, more)))
+            starts = np.pad(linear_starts(self.tests, middle[3]), ((0, 0), (0, 0), (0, len(self.varying))))
         return self.particles(white, centre, width, theta, starts)
 
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
@@ -283,28 +262,21 @@ def fit_tests(
     *,
     correlated: bool = True,
     rounds: int = ROUNDS,
-    block: int = 0,
     start: Start | None = None,
     progress: Progress = lambda _: None,
 ) -> Fit:
-    """Fit particles, noise and population.
+    """Fit particles, noise and population, from a first guess of the noise of displacement from point to point [um].
 
-    Particles come first, each on its own. Then, in turns: the noise from residuals linear in the particles' numbers,
-    the most probable population under the summaries, the most probable particles under that population. The noise is
-    what is left under the model at hand: with effects it is not estimated before they are in, and every further step is
-    halved until the tests are more probable where it ends (`_Fitter.step`).
-
-    Args:
-        read_out_um: noise of displacement from point to point, a first guess [um].
-        correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
-            not move.
-        rounds: how often noise, population and particles take turns, at least.
-        block: particles of a block; of `block_size` if 0.
-        start: where to begin; the last turn is then the only one, unless the tests want more.
+    Particles come first, each on its own. Then, in `rounds` turns at least: the noise from residuals linear in the
+    particles' numbers, the most probable population under the summaries, the most probable particles under that
+    population. With a start the last turn is the only one, unless the tests want more. The noise is what is left under
+    the model at hand: with effects it is not estimated before they are in, and every further step is halved until the
+    tests are more probable where it ends (`_Fitter.step`). Noise that is not `correlated` is white, see
+    `take_white_noise`.
     """
     check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
     effects, count = bool(model.effects), len(tests)
-    fitter = _Fitter(tests, model, Blocks(count, block), progress)
+    fitter = _Fitter(tests, model, progress)
     first = fitter.begin(max(read_out_um, 1e-4)) if start is None else fitter.begin_at(start)
     begun = 0 if start is None else rounds
     free, turn = None, begun
@@ -423,7 +395,8 @@ def start_of_effects(point: Point, tests: Tests, noise: Noise, model: Model, blo
         there = replace(point, theta=jnp.asarray(np.broadcast_to(here, (len(tests), len(here)))))
         linear = blocks.all(linearise, (there, tests), forms)
         shared = model.zero_prior[1], model.correlation, model.along
-        gram = np.asarray(blocks.all(effects_grams, (tests, linear, noise), *shared)).sum(0)
+        grams, _ = blocks.all(grams_and_likelihoods, (noise.scale, tests, linear), noise.logs[None], *shared)
+        gram = np.asarray(grams)[:, 0].sum(0)
         for i, (v, places) in enumerate(zip(model.effects, forms.places, strict=True)):
             score, amplitude = gram[i, -1], gram[i, -1] / max(gram[i, i], 1e-300)
             gain = score * amplitude if v.sign * amplitude >= 0 else 0.0

@@ -92,17 +92,12 @@ class Forms(eqx.Module):
 
 
 class Point(eqx.Module):
-    """Where tests are linearised.
+    """Where tests are linearised."""
 
-    Attributes:
-        latent: b1, b3, b5, e of every particle.
-        zero: zeros of displacement [um].
-        theta: numbers of the effects of every particle, in the order of `Forms.names`; amplitudes may differ from
-            particle to particle, the others are the same for all.
-    """
-
-    latent: Float[Array, "particles 4"]
-    zero: Float[Array, " particles"]
+    latent: Float[Array, "particles 4"]  # b1, b3, b5, e of every particle
+    zero: Float[Array, " particles"]  # zeros of displacement [um]
+    # numbers of the effects of every particle, in the order of `Forms.names`; amplitudes may differ from particle to
+    # particle, the others are the same for all
     theta: Float[Array, "particles numbers"]
 
 
@@ -136,11 +131,9 @@ def linearise(point: Point, tests: Tests, forms: Forms, *, with_numbers: bool = 
     Nothing that is compiled on the way holds both the law and the formula of an effect (`mcc_jax.law.derivatives`), so
     this is not to be compiled itself. Derivatives by the numbers may be left out.
     """
-    residual, columns, by_force, by_peak = derivatives(
-        point.latent, point.zero, point.theta, tests, forms, with_numbers
-    )
-    found = residual, columns, by_force, by_peak, by_force + by_peak
-    return Linear(*map(jnp.asarray, found))
+    found = derivatives(point.latent, point.zero, point.theta, tests, forms, with_numbers)
+    _, _, by_force, by_peak = found
+    return Linear(*map(jnp.asarray, (*found, by_force + by_peak)))
 
 
 def derivatives(

@@ -18,7 +18,6 @@ from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.findings import named
 from ..campaign.plausibility import add_likely_unit_error
-from .draws import Fit
 
 MODULUS_OPEN = "unknown modulus"  # the `check` of the finding that the tests leave the modulus open
 UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
@@ -45,50 +44,6 @@ FEW = 0.01
 UNKNOWN = 0.5
 
 
-def misfit_note(own_misfit: float) -> str | None:
-    """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
-    if not own_misfit > LARGE_MISFIT:
-        return None
-    return (
-        "even with its own C1, C3, C5 the law misses a test's displacements by "
-        f"{100 * own_misfit:.0f} % of their range (median): "
-        "either it describes these tests badly, or they are not compressions of single particles"
-    )
-
-
-def noise_note(share: float, by: str) -> str | None:
-    """A sentence if correlated noise has taken up what the law misses, `by` so much, else None."""
-    if not share > CORRELATED_SHARE:
-        return None
-    return (
-        f"the law misses displacements by {by}; {100 * share:.0f} % of that is correlated along a test: more likely "
-        "something that the law lacks than noise of the instrument; mcc_jax.discover looks for what it is"
-    )
-
-
-def noise_share(fit: Fit) -> float:
-    """Share of the residual variance that the fit attributes to correlated noise [-].
-
-    Read-out and force noise is white: what is correlated along a test and no smaller is rather what the law misses.
-    """
-    variance, correlated = _variances(fit)
-    return float(np.median(correlated / variance))
-
-
-def at_noise_level(fit: Fit, rms_um: np.ndarray) -> bool:
-    """Whether what the law misses, `rms_um` of every particle, is mostly white noise of read-out and force: correlated
-    noise and a common factor on the noise, which grow with a misfit, do not count."""
-    variance, correlated = _variances(fit)
-    return bool(np.median((1 - CORRELATED_SHARE) * rms_um**2 - (variance - correlated)) <= 0)
-
-
-def _variances(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Mean variance of every test's noise [um^2], and of its correlated part."""
-    noise, mask = fit.noise.noise, np.asarray(fit.tests.mask)
-    variance = np.where(mask, np.asarray(fit.filters.solver.matrix.diag.d), 0.0).sum(1) / np.maximum(mask.sum(1), 1)
-    return variance, (np.asarray(noise.scale) * float(noise.correlated)) ** 2
-
-
 def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray) -> Finding | None:
     """The particles whose residual is unlike all others', both in micrometres and as a share of their range.
 
@@ -99,7 +54,10 @@ def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray
     if known.sum() < LEAST:
         return None
     far = np.zeros(len(rms), bool)
-    far[known] = _far(np.log(rms[known])) & _far(np.log(rms[known] / reach[known]))
+    logs = np.log([rms[known], rms[known] / reach[known]])
+    away = logs - np.median(logs, axis=1, keepdims=True)
+    spread = 1.4826 * np.median(np.abs(away), axis=1, keepdims=True)
+    far[known] = np.all(away > np.maximum(OUTLYING * spread, np.log(TIMES)), axis=0)
     if not far.any() or far.sum() > max(1, SHARE * len(rms)):
         return None
     which = tuple(n for n, out in zip(names, far, strict=True) if out)
@@ -139,12 +97,6 @@ def is_unknown(modulus: Mapping[str, Any]) -> bool:
 def modulus_is_open(content: Mapping[str, Any]) -> bool:
     """Whether the tests leave the modulus open, from the findings of a `calibration.json`."""
     return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
-
-
-def _far(logs: np.ndarray) -> np.ndarray:
-    away = logs - np.median(logs)
-    spread = 1.4826 * float(np.median(np.abs(away)))
-    return away > max(OUTLYING * spread, np.log(TIMES))
 
 
 def judged(
@@ -199,12 +151,10 @@ def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             yield
-    except InputError:
-        raise
-    except (np.linalg.LinAlgError, FloatingPointError, OverflowError, ZeroDivisionError, ValueError) as error:
+    except (ArithmeticError, ValueError) as error:
         text = str(error)
         # A ValueError of ours is about an argument; those of NumPy and SciPy that are meant here speak of NaN.
-        if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError) and "infs or NaN" not in text:
+        if not isinstance(error, ArithmeticError | np.linalg.LinAlgError) and "infs or NaN" not in text:
             raise
         problem, remedy = add_likely_unit_error(
             campaign,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, get_args
 
 import jax
@@ -15,12 +15,12 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Progress
-from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .compiling import one_blas_thread
-from .data import Selection, Tests
+from .data import Tests
 from .draws import Fit
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
-from .fitting import beyond_numbers, checked_settings, prepare
+from .fitting import checked_settings, prepare
 from .forward import residuals
 from .judgement import numbers_in_reach
 from .numpyro_model import Model
@@ -37,18 +37,13 @@ OPEN = 1e-3  # a combination of shared parameters is open where its curvature, e
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data say of combinations of the shared parameters.
+    """What the data say of combinations of the shared parameters."""
 
-    Attributes:
-        singular_values: of the curvature, every parameter on its own scale, largest first; all would be 1 if the
-            parameters did not interact, and 0 marks a combination that the data leave open.
-        directions: the combinations, one row each, in the order of `names`.
-        names: of the parameters.
-    """
-
+    # of the curvature, every parameter on its own scale, largest first; all would be 1 if the parameters did not
+    # interact, and 0 marks a combination that the data leave open
     singular_values: np.ndarray
-    directions: np.ndarray
-    names: tuple[str, ...] = SHARED
+    directions: np.ndarray  # the combinations, one row each, in the order of `names`
+    names: tuple[str, ...]  # of the parameters
 
     __repr__ = described()
 
@@ -59,75 +54,61 @@ class Identifiability:
         return [" ".join(f"{w:+.2f} {n}" for w, n in zip(row, self.names, strict=True) if abs(w) > 0.1) for row in rows]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class LeastSquares(JointCalibration):
     """The joint least-squares fit of a campaign.
 
     Attributes:
-        campaign: the tests, checked; `campaign.raw` as they were given.
-        selection: which particles and points took part.
-        model: what was assumed.
         loss: the loss of the residuals.
-        fit: noise and spread that set the weights.
         settings: the pooled problem.
         solution: its solution.
-        identifiability: what the data leave open.
         agreeing_starts: how many starts ended at the same optimum, of how many.
-        seed, runtime_s: for the record; nothing here is random.
-        findings: what a reader must know of the tests and of the plausibility of the answer.
-        notes: what else a reader must know.
     """
 
-    campaign: Campaign
-    selection: Selection
-    model: Model
+    method = "least-squares"
+
     loss: Loss
-    fit: Fit
     settings: Pooled
     solution: Solution
-    identifiability: Identifiability
     agreeing_starts: tuple[int, int]
-    seed: int
-    runtime_s: float
-    findings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
 
-    @property
-    def reason(self) -> str:
-        """Why the fit must not be called converged; empty if it is."""
+    def failures(self) -> list[str]:
+        """Why the fit must not be called converged; empty if every optimiser met its tolerances."""
         if not bool(self.solution.converged):
-            return f"the optimiser did not meet its tolerances within {int(self.solution.steps)} steps"
+            return [f"the optimiser did not meet its tolerances within {int(self.solution.steps)} steps"]
         inside_out = np.flatnonzero(~(self._shape_factor > 0))
         if len(inside_out):
-            return (
+            return [
                 f"a = {float(self.solution.value.shared[0]):.3g} leaves particle {self.particles[inside_out[0]]!r} "
                 "without a positive shape factor: the curves do not come together under it; "
                 "check the units and the signs of the columns, and the diameters"
-            )
-        for name, fine in zip(("the noise", "the spread of the particles"), self.fit.converged[1:], strict=True):
-            if not fine:
-                return f"the optimiser for {name} did not meet its tolerances"
-        return ""
+            ]
+        parts = zip(("the noise", "the spread of the particles"), self.fit.converged[1:], strict=True)
+        return [f"the optimiser for {name} did not meet its tolerances" for name, fine in parts if not fine][:1]
 
-    @property
-    def converged(self) -> bool:
-        """Whether every optimiser met its tolerances."""
-        return not self.reason
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """What the data leave open: the curvature of the shared parameters, all particles' own ones eliminated."""
+        complement = np.asarray(self.solution.normal.schur()[2])
+        raw = np.diagonal(np.asarray(self.solution.normal.shared))
+        scale = 1 / np.sqrt(np.where(raw > 0, raw, 1.0))
+        scaled = complement * scale * scale[:, None]
+        # On the scale of what is left of each parameter's curvature when the particles are eliminated.
+        left = np.sqrt(np.maximum(np.diagonal(scaled), 1e-300))
+        values, vectors = np.linalg.eigh(scaled / left / left[:, None])
+        names = (*SHARED, *self.model.forms.names)
+        return Identifiability(np.maximum(values[::-1], 0.0), vectors.T[::-1], names)
 
-    def warnings(self) -> list[str]:
-        """What a reader of the numbers must know, one sentence each."""
-        notes = [self.reason] if self.reason else []
-        notes += map(str, self.findings)
-        notes += [f"the data leave this combination open: {text}" for text in self.identifiability.open]
+    def _notes(self) -> list[str]:
+        notes = [f"the data leave this combination open: {text}" for text in self.identifiability.open]
         agree, count = self.agreeing_starts
         if agree < count:
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
-        notes += self._notes_of_the_fit()
         if self._alone:
             notes.append("one particle says nothing of the scatter between particles: no spread is given")
         elif small := [n for n, t in zip(COEFFICIENTS, self.settings.population.tau, strict=True) if t < 1e-3]:
             notes.append(f"the spread of {', '.join(small)} cannot be distinguished from zero")
-        return notes
+        return notes + super()._notes()
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
@@ -138,9 +119,7 @@ class LeastSquares(JointCalibration):
             "effective_modulus_MPa": log_estimate(*modulus),
         }
 
-    @cached_property
-    def content(self) -> dict[str, Any]:
-        """The contents of `calibration.json`."""
+    def _further_content(self) -> dict[str, Any]:
         tests = self.selection.tests
         point = unpack(self.solution.value, self.settings, tests)
         latent, zero, theta = np.asarray(point.latent), np.asarray(point.zero), np.asarray(point.theta)
@@ -166,23 +145,16 @@ class LeastSquares(JointCalibration):
                 found["amplitudes"] = {m: estimate(float(theta[row, k])) for m, k in places.items()}
             return found
 
-        tau = np.asarray(self.settings.population.tau)
-        spread_sd = self._spread_sd()
-        steps = int(self.solution.steps)
+        tau, steps = np.asarray(self.settings.population.tau), int(self.solution.steps)
         return {
-            "schema": 1,
-            "method": "least-squares",
-            **self.answer(),
-            "reason": self.reason or f"the tolerances were met after {steps} steps",
-            "runtime_s": self.runtime_s,
-            "seed": self.seed,
+            "reason": " ".join(self.failures()) or f"the tolerances were met after {steps} steps",
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
             "effects": effect_entries(self.model, self._effects()),
             "loss": self.loss,
             **{
                 f"log_{name}": {
                     "mean": normal_estimate(values[2 + j], sds[2 + j]),
-                    "sd": estimate(None) if self._alone else normal_estimate(tau[j], spread_sd[j], least=0.0),
+                    "sd": estimate(None) if self._alone else normal_estimate(tau[j], self._spread_sd(name), least=0.0),
                 }
                 for j, name in enumerate(COEFFICIENTS)
             },
@@ -190,9 +162,7 @@ class LeastSquares(JointCalibration):
             "yield_stress_MPa": estimate(None if self._alone else power_of_e(values[2] + tau[0] ** 2 / 2) / 17.16),
             "noise": self._noise_numbers(),
             "priors": self.model.chosen_priors.to_json(),
-            "particles": self._entries(numbers),
-            "warnings": self.warnings(),
-            "findings": [one.to_json() for one in self.findings],
+            "particles": self._entries_of_tests(numbers),
             "diagnostics": {
                 **NO_SAMPLER,
                 "steps": steps,
@@ -238,15 +208,12 @@ class LeastSquares(JointCalibration):
         """Whether one particle is all there is: the mode of a spread of one is 0, and means nothing."""
         return len(self.selection.kept) == 1
 
-    def _spread_sd(self) -> np.ndarray:
-        """Standard deviations of the three spreads, from those of their coordinates."""
-        mode, sd = np.asarray(self.fit.mode), np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))
-        found = []
-        for name in COEFFICIENTS:
-            place = self.fit.names.index(f"tau_{name}_coordinate")
-            spread = SpreadCoordinate(getattr(self.model.chosen_priors, f"tau_{name}")).spread
-            found.append(abs(float(jax.grad(spread)(jnp.asarray(mode[place])))) * sd[place])
-        return np.array(found)
+    def _spread_sd(self, name: str) -> float:
+        """Standard deviation of a coefficient's spread, from that of its coordinate."""
+        place = self.fit.names.index(f"tau_{name}_coordinate")
+        spread = SpreadCoordinate(getattr(self.model.chosen_priors, f"tau_{name}")).spread
+        slope = jax.grad(spread)(jnp.asarray(np.asarray(self.fit.mode)[place]))
+        return abs(float(slope)) * float(np.sqrt(np.asarray(self.fit.covariance)[place, place]))
 
     def _effects(self) -> dict[str, Any]:
         """Estimates of the effects' numbers by the names of their sites."""
@@ -263,19 +230,6 @@ class LeastSquares(JointCalibration):
         used = int(np.asarray(self.selection.tests.mask).sum())
         freedom = max(used - 4 * len(self.selection.kept) - 5, 1)
         return float(np.sum(np.asarray(self.solution.residual[0]) ** 2) / freedom)
-
-
-def identifiability(solution: Solution, names: tuple[str, ...] = SHARED) -> Identifiability:
-    """Singular values and directions of the shared parameters' curvature, all particles' own parameters eliminated."""
-    complement = np.asarray(solution.normal.schur()[2])
-    raw = np.diagonal(np.asarray(solution.normal.shared))
-    scale = 1 / np.sqrt(np.where(raw > 0, raw, 1.0))
-    scaled = complement * scale * scale[:, None]
-    # On the scale of what is left of each parameter's curvature when the particles are eliminated.
-    left = np.sqrt(np.maximum(np.diagonal(scaled), 1e-300))
-    values, vectors = np.linalg.eigh(scaled / left / left[:, None])
-    order = np.argsort(values)[::-1]
-    return Identifiability(np.maximum(values[order], 0.0), vectors.T[order], names)
 
 
 @one_blas_thread
@@ -319,9 +273,8 @@ def least_squares(
     if model.robust and loss != "linear":
         raise InputError("robust noise and a robust loss exclude each other", remedy="Take one of them.")
     with numbers_in_reach(campaign):
-        selection, fit, _ = prepare(
-            campaign, model, threshold_MPa, progress=progress, correlated=loss == "linear", rounds=1
-        )
+        options: dict[str, Any] = {"correlated": loss == "linear", "rounds": 1}
+        selection, fit = prepare(campaign, model, threshold_MPa, progress=progress, **options)
         tests, population = fit.tests, fit.population
         further = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
         priors = model.zero_prior, jnp.asarray(np.array(further).reshape(-1, 2))
@@ -334,27 +287,23 @@ def least_squares(
         found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
         losses = np.nan_to_num([float(one.loss) for one in found], nan=np.inf, posinf=np.inf)
         if np.isinf(losses).all():
-            raise beyond_numbers(campaign, selection)
+            raise FloatingPointError("no sum of squares is finite")
     best = found[int(np.argmin(losses))]
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
     calibration = LeastSquares(
-        campaign,
-        selection,
-        fit.model,
-        loss,
-        fit,
-        settings,
-        best,
-        identifiability(best, (*SHARED, *model.forms.names)),
-        (agree, len(starts)),
-        seed,
-        runtime_s=0.0,
+        campaign=campaign,
+        selection=selection,
+        model=fit.model,
+        fit=fit,
+        seed=seed,
+        loss=loss,
+        settings=settings,
+        solution=best,
+        agreeing_starts=(agree, len(starts)),
     )
-
-    def again(some: Campaign) -> dict[str, Any]:
-        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed}
-        return least_squares(some, model, without_flagged=False, **settings).answer()
-
+    again = partial(
+        least_squares, model=model, threshold_MPa=threshold_MPa, loss=loss, seed=seed, without_flagged=False
+    )
     return calibration.judged(started, again if without_flagged else None)
 
 

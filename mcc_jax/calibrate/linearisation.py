@@ -60,8 +60,7 @@ def coordinates(
         x, q = jnp.log(theta[k] / at[k]), straight.power[k]
         away = away.at[k].set(at[k] * box_cox(x, q))
         factor = factor.at[amplitude].multiply(jnp.exp(jnp.clip(straight.shear[k] * x, -FARTHEST, FARTHEST)))
-    amplitudes = sorted({amplitude for _, amplitude in places})
-    for k in amplitudes:
+    for k in sorted({amplitude for _, amplitude in places}):
         away = away.at[k].set(theta[k] * factor[k] - at[k])
     return away, factor
 
@@ -109,10 +108,11 @@ class Linearisation:
         numbers = point.theta.shape[1]
         if not numbers:
             return self._blocks.all(linearise, (point, self._tests), self._forms)
-        if sd is not None:
+        if sd is None:
+            sd = np.zeros(numbers)
+        else:
             self._straighten(point, sd)
-        steps = np.zeros(numbers) if sd is None else sd
-        bends = [self._bend(point, k, float(steps[k])) for k in range(numbers)]
+        bends = [self._bend(point, k, float(sd[k])) for k in range(numbers)]
         return replace(self._moved(point, np.zeros(numbers)), bends=jnp.asarray(np.concatenate(bends, -1)))
 
     def _straighten(self, point: Point, sd: np.ndarray) -> None:

@@ -58,14 +58,13 @@ class Along(enum.Enum):
 
 
 class Noise(eqx.Module):
-    """Standard deviations of white noise of displacement [um] and force [mN] and of the correlated residual [um], its
-    correlation length, in shares of the peak force passed [-] or in seconds, and each particle's factor on all [-]."""
+    """Standard deviations of white noise of displacement [um] and force [mN] and of the correlated residual [um]."""
 
     displacement: Scalar
     force: Scalar
     correlated: Scalar
-    length: Scalar
-    scale: Float[Array, " particles"]
+    length: Scalar  # of the correlation, in shares of the peak force passed [-] or in seconds
+    scale: Float[Array, " particles"]  # each particle's factor on all [-]
 
     @property
     def logs(self) -> Float[Array, " 4"]:
@@ -90,17 +89,13 @@ MASKED_UM2 = 1e12
 
 
 class Whitening(eqx.Module):
-    """The factored covariance of one test's noise, which turns residuals into independent ones of variance 1.
+    """The factored covariance of one test's noise, which turns residuals into independent ones of variance 1."""
 
-    `solver` is the factor of the quasiseparable part, white and correlated noise; `peak` and `common` the whitened
-    changes of every point with the errors of its branch's peak and of the zero of force.
-    """
-
-    solver: QuasisepSolver
+    solver: QuasisepSolver  # the factor of the quasiseparable part, white and correlated noise
     mask: Bool[Array, " steps"]
-    peak: Path
+    peak: Path  # the whitened changes of every point with the error of its branch's peak
     branch: Int[Array, " steps"]
-    common: Path | None = None
+    common: Path | None = None  # the same with the error of the zero of force
     weights: Path | None = None
 
     def __call__(self, values: Float[Array, "steps columns"]) -> Float[Array, "steps columns"]:
@@ -215,14 +210,11 @@ def whitening(
         # A root has no slope at 0, and most peaks were read and not worked out.
         known = tests.peak_sd > 0
         error = jnp.where(known, jnp.sqrt(jnp.where(known, error**2 + tests.peak_sd**2, 1.0)), error)
-    directions = [error * linear.by_peak]
-    if tests.force_zero_sd is not None:
-        directions.append(tests.force_zero_sd * linear.by_offset)
-    white = forward_substitution(solver, jnp.stack(directions, 1))
-    branches = Whitening(solver, tests.mask, white[:, 0], tests.branch, None, tests.reading_weight)
+    peak = forward_substitution(solver, (error * linear.by_peak)[:, None])[:, 0]
+    found = Whitening(solver, tests.mask, peak, tests.branch, None, tests.reading_weight)
     if tests.force_zero_sd is None:
-        return branches
-    return replace(branches, common=branches(jnp.stack(directions, 1))[:, 1])
+        return found
+    return replace(found, common=found((tests.force_zero_sd * linear.by_offset)[:, None])[:, 0])
 
 
 def _read_out(noise: Noise, tests: Tests, linear: Linear) -> Array:
@@ -263,29 +255,8 @@ def student_weights(squares: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, 
     return weight, float(max(sandwich * np.mean(w) / np.mean(w * z2), 1.0))
 
 
-def without_own(
-    noise: Noise,
-    scale: Scalar,
-    tests: Tests,
-    linear: Linear,
-    zero_sd: Scalar,
-    correlation: Correlation,
-    along: Along,
-) -> tuple[Float[Array, "q q"], Scalar]:
-    """Gram matrix of one test's effects and residual, the particle's b1, b3, b5, e and zero integrated out, and the log
-    of the factor that goes with it.
-
-    They have standard deviations of 1 and `zero_sd`: wide, and enough to keep directions without data in place.
-    """
-    filtered = whitening(noise, scale, tests, linear, correlation, along)
-    own = linear.columns[:, :4], jnp.where(tests.mask, zero_sd, 0.0)[:, None]
-    white = filtered(jnp.concatenate([*own, linear.columns[:, 4:], linear.residual[:, None]], 1))
-    left, log_integral = eliminate(white.T @ white, tuple(range(5)), jnp.ones(5))
-    return left, log_integral - 0.5 * filtered.log_det
-
-
 @compiled
-def likelihoods(
+def grams_and_likelihoods(
     scale: Float[Array, " particles"],
     tests: Tests,
     linear: Linear,
@@ -293,31 +264,26 @@ def likelihoods(
     zero_sd: Scalar,
     correlation: Correlation,
     along: Along,
-) -> Float[Array, "particles many"]:
-    """Log likelihood of each test without effects under each of many noises, the particle's numbers integrated out."""
+) -> tuple[Float[Array, "particles many q q"], Float[Array, "particles many"]]:
+    """Gram matrix of each test's effects and residual under each of many noises, and log likelihood without effects.
 
-    def of_each(logs: Array) -> Array:
+    The particle's b1, b3, b5, e and zero are integrated out, with standard deviations of 1 and `zero_sd`: wide, and
+    enough to keep directions without data in place.
+    """
+
+    def of_each(logs: Array) -> tuple[Array, Array]:
         noise = Noise.from_logs(logs, scale)
 
-        def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Scalar:
-            left, factor = without_own(noise, scale, tests, linear, zero_sd, correlation, along)
-            return factor - 0.5 * left[-1, -1]
+        def of_one(scale: Scalar, tests: Tests, linear: Linear) -> tuple[Array, Array]:
+            filtered = whitening(noise, scale, tests, linear, correlation, along)
+            own = linear.columns[:, :4], jnp.where(tests.mask, zero_sd, 0.0)[:, None]
+            white = filtered(jnp.concatenate([*own, linear.columns[:, 4:], linear.residual[:, None]], 1))
+            left, log_integral = eliminate(white.T @ white, tuple(range(5)), jnp.ones(5))
+            return left, log_integral - 0.5 * filtered.log_det - 0.5 * left[-1, -1]
 
         return jax.vmap(of_one)(scale, tests, linear)
 
     return jax.vmap(of_each, out_axes=1)(logs)
-
-
-@compiled
-def effects_grams(
-    tests: Tests, linear: Linear, noise: Noise, zero_sd: Scalar, correlation: Correlation, along: Along
-) -> Float[Array, "particles q q"]:
-    """Gram matrix of the effects' columns and the residual of each test, the particle's numbers integrated out."""
-
-    def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Array:
-        return without_own(noise, scale, tests, linear, zero_sd, correlation, along)[0]
-
-    return jax.vmap(of_one)(noise.scale, tests, linear)
 
 
 # Steps of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size.
@@ -326,18 +292,13 @@ OUTLYING = 5.0  # a particle whose noise differs by so many standard deviations 
 
 
 class NoiseFit(eqx.Module):
-    """The noise of a campaign, covariance of the logarithms of its four numbers, what these add to a log marginal
-    likelihood (log prior and Laplace's volume; NaN where not worked out), and whether the optimiser converged."""
+    """The noise of a campaign, whether the optimiser converged, and, NaN where not worked out, covariance of the
+    logarithms of its four numbers and what these add to a log marginal likelihood (log prior and Laplace's volume)."""
 
     noise: Noise
-    covariance: Float[Array, "4 4"]
-    log_evidence: Float[Array, ""]
     converged: bool = eqx.field(static=True)
-
-    @classmethod
-    def unsure(cls, noise: Noise, *, converged: bool) -> NoiseFit:
-        """A noise of which no error is known."""
-        return cls(noise, jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan), converged)
+    covariance: Array = eqx.field(default_factory=lambda: jnp.asarray(np.full((4, 4), np.nan)))
+    log_evidence: Array = eqx.field(default_factory=lambda: jnp.asarray(np.nan))
 
     @property
     def log_sd(self) -> np.ndarray:
@@ -365,19 +326,18 @@ def estimate_noise(
     bounds = [(m - 3 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
     inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
-    noise = Noise.of(np.exp(found.x), start.scale)
+    noise, converged = Noise.of(np.exp(found.x), start.scale), bool(found.success)
     if not uncertainty:
-        return NoiseFit.unsure(noise, converged=bool(found.success))
+        return NoiseFit(noise, converged)
     steps = WIDE_STEP * np.eye(4)
     up, down = (np.array([value_and_gradient(found.x + step)[1] for step in way]) for way in (steps, -steps))
     curvature = (up - down) / (2 * WIDE_STEP)
     if not np.isfinite(curvature).all():
-        return NoiseFit.unsure(noise, converged=False)
+        return NoiseFit(noise, converged=False)
     values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
     values = np.maximum(values, 1e-6)
     volume = float(prior.log_density(found.x)) + 2 * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values))
-    covariance = jnp.asarray((vectors / values) @ vectors.T)
-    return NoiseFit(noise, covariance, jnp.asarray(volume), bool(found.success))
+    return NoiseFit(noise, converged, jnp.asarray((vectors / values) @ vectors.T), jnp.asarray(volume))
 
 
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:

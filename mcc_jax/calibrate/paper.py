@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import equinox as eqx
@@ -21,7 +20,6 @@ from ..campaign import (
     THRESHOLD_MPA,
     Adjustment,
     Campaign,
-    Finding,
     adjust,
     check_tests,
     effective_diameter_um,
@@ -30,12 +28,13 @@ from ..campaign import (
     stress_and_strain,
 )
 from ..campaign.adjustment import refusal
+from ..campaign.signal import point_noise
 from ..geometry import plastic_shape_factor
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
-from .curves import responses
-from .data import MOST_POINTS, padded_length, point_noise_um, records_of, rows_from_contact
-from .estimates import NO_SAMPLER, estimate, finite, force_zero
-from .judgement import judged, misfit_note, numbers_in_reach, unlike_others
+from .curves import RIGID_MPA, responses_um
+from .data import MOST_POINTS, row_kinds, rows_from_contact
+from .estimates import NO_SAMPLER, estimate, finite
+from .judgement import numbers_in_reach
 from .paper_steps import (
     ElasticFit,
     MasterCurve,
@@ -53,31 +52,22 @@ from .paper_steps import (
 )
 from .population import COEFFICIENTS
 from .results import Calibration
-from .sharding import Blocks
 
 LARGEST_SHAPE_FACTOR = 4.0  # twice the paper's largest: shape factors beyond come from curves that do not collapse
 
 
 @dataclass(frozen=True)
 class ParticleFit:
-    """One particle against the calibrated law.
+    """One particle against the calibrated law."""
 
-    Attributes:
-        plastic: C1, C3, C5 of this particle's own adjusted loading curve, under the common `a`.
-        zero_um: what the offset step, and the contact point, take off its displacement [um].
-        measured_um: measured displacement less `zero_um` [um], at every point.
-        predicted_um: displacement under the measured force by the mean law, scaled by this particle's size and shape
-            [um].
-        own_um: the same with the particle's own C1, C3, C5.
-        used: which points enter `rms_um`: those after contact and above the threshold that may be compared.
-    """
-
+    # C1, C3, C5 of this particle's own adjusted loading curve, under the common `a`
     plastic: tuple[float, float, float]
-    zero_um: float
-    measured_um: np.ndarray
+    zero_um: float  # what the offset step, and the contact point, take off its displacement [um]
+    measured_um: np.ndarray  # measured displacement less `zero_um` [um], at every point
+    # displacement under the measured force by the mean law, scaled by this particle's size and shape [um]
     predicted_um: np.ndarray
-    own_um: np.ndarray
-    used: np.ndarray
+    own_um: np.ndarray  # the same with the particle's own C1, C3, C5
+    used: np.ndarray  # which points enter `rms_um`: those after contact and above the threshold that may be compared
 
     __repr__ = described()
 
@@ -101,12 +91,11 @@ class ParticleFit:
         return float(np.sqrt(np.mean(away**2))) if len(away) else float("nan")
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class PaperCalibration(Calibration):
     """Everything that the paper's calibration finds, with what it was made from.
 
     Attributes:
-        campaign: the tests, checked; `campaign.raw` as they were given.
         adjustment: the offset step.
         table: strain over stress of the kept particles.
         shape: `a` by the full objective; the one in `law`, unless the reference objective was asked for.
@@ -119,12 +108,10 @@ class PaperCalibration(Calibration):
         particles: one entry per particle of the campaign, None where it was not kept.
         displacement_noise_um: standard deviation of displacement from point to point [um], for comparison with the
             residuals.
-        seed: kept for the record; nothing here is random.
-        runtime_s: time taken.
-        findings: what a reader must know of the tests and of the plausibility of the answer.
     """
 
-    campaign: Campaign
+    method = "paper"
+
     adjustment: Adjustment
     table: StrainTable
     shape: ShapeFit
@@ -136,9 +123,6 @@ class PaperCalibration(Calibration):
     mean_law: MccLaw
     particles: tuple[ParticleFit | None, ...]
     displacement_noise_um: float
-    seed: int
-    runtime_s: float
-    findings: tuple[Finding, ...] = ()
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
         """Every row from contact on of every kept particle's curve, and which of them are compared."""
@@ -156,19 +140,21 @@ class PaperCalibration(Calibration):
         return float(self.mean_law.a)
 
     @property
-    def converged(self) -> bool:
-        """Whether shape parameter and modulus both converged."""
-        return self.chosen_shape.converged and self.elastic.converged
-
-    @property
     def chosen_shape(self) -> ShapeFit:
         """The fit whose `a` is in the law."""
         return self.shape if self.objective == "full" or self.shape_reference is None else self.shape_reference
 
-    def warnings(self) -> list[str]:
-        """What a reader of the numbers must know, one sentence each."""
-        notes = [reason for reason in (self.chosen_shape.reason, self.elastic.reason) if reason]
-        notes += map(str, self.findings)
+    @property
+    def why_not(self) -> tuple[str | None, ...]:
+        """Why each particle of the campaign took no part; None if it did."""
+        return self.adjustment.why_not
+
+    def failures(self) -> list[str]:
+        """Why shape parameter or modulus could not be found."""
+        return [reason for reason in (self.chosen_shape.reason, self.elastic.reason) if reason]
+
+    def _notes(self) -> list[str]:
+        notes = []
         if self.plastic.at_bound:
             notes.append(
                 f"{', '.join(self.plastic.at_bound)} ended at the lower bound: a collapsed estimate, not a measurement"
@@ -180,42 +166,24 @@ class PaperCalibration(Calibration):
             notes.append(
                 f"{100 * share:.0f} % of particles drawn from this population would have a law that is not monotone"
             )
-        dropped = int((~self.adjustment.kept).sum())
-        if dropped:
-            notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
         largest = float(self.table.shape_factor(self.a).max())
         if largest > LARGEST_SHAPE_FACTOR:
             notes.append(
                 f"a = {self.a:.3g} makes shape factors of up to {largest:.3g}: "
                 "the shape factor does not bring these curves together"
             )
-        if self.misfit_note is not None:
-            notes.append(self.misfit_note)
         return notes
-
-    @property
-    def misfit_note(self) -> str | None:
-        """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
-        return misfit_note(self.own_misfit)
-
-    @property
-    def relative_misfit(self) -> float:
-        """Median over the particles of `rms_um` over the range of displacement [-], with their scatter."""
-        return self._misfit("rms_um")
-
-    @property
-    def own_misfit(self) -> float:
-        """The same with every particle's own coefficients: what the form of the law leaves."""
-        return self._misfit("own_rms_um")
-
-    def _misfit(self, name: str) -> float:
-        return float(np.median([getattr(p, name) / max(p.range_um, 1e-300) for p in self._compared.values()]))
 
     @property
     def _compared(self) -> dict[str, ParticleFit]:
         """The particles of which points are compared with the law, by name."""
         fits = zip(self.campaign.particles, self.particles, strict=True)
         return {name: fit for name, fit in fits if fit is not None and fit.used.any()}
+
+    def _own_residuals(self) -> tuple[Sequence[str], np.ndarray, np.ndarray]:
+        fits = self._compared
+        rms, ranges = np.array([(one.own_rms_um, one.range_um) for one in fits.values()]).reshape(-1, 2).T
+        return tuple(fits), rms, ranges
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
@@ -225,33 +193,23 @@ class PaperCalibration(Calibration):
             "effective_modulus_MPa": estimate(self.elastic.effective_modulus_MPa),
         }
 
-    @cached_property
-    def content(self) -> dict[str, Any]:
-        """The contents of `calibration.json`."""
+    def _further_content(self) -> dict[str, Any]:
         population = self.plastic.population
         eta = np.asarray(eqx.filter_vmap(self.mean_law.shape_factor)(particle_batch(self.campaign.diameters_um)))
-        entries = [
-            {
-                "particle": name,
+
+        def numbers(i: int) -> dict[str, Any]:
+            fit = self.particles[i]
+            return {
                 "eta_p": estimate(float(eta[i])),
                 **{key: estimate(fit.plastic[j] if fit else None) for j, key in enumerate(COEFFICIENTS)},
                 "zero_um": estimate(fit.zero_um if fit else None),
-                "rms_um": finite(fit.rms_um) if fit else None,
-                "own_rms_um": finite(fit.own_rms_um) if fit else None,
-                "kept": fit is not None,
-                "why_not": self.adjustment.why_not[i],
-                "force_zero_mN": force_zero(self.campaign.curves[i]),
+                "rms_um": finite(fit.rms_um if fit else None),
+                "own_rms_um": finite(fit.own_rms_um if fit else None),
             }
-            for i, (name, fit) in enumerate(zip(self.campaign.particles, self.particles, strict=True))
-        ]
+
         reference = self.shape_reference
         place = None if reference is None else reference.reference
         return {
-            "schema": 1,
-            "method": "paper",
-            **self.answer(),
-            "runtime_s": self.runtime_s,
-            "seed": self.seed,
             "law": {"unloading": self.mean_law.unloading.value, "strain_scaling": self.mean_law.strain_scaling.value},
             "effects": [],
             "a_objective": self.objective,
@@ -266,9 +224,7 @@ class PaperCalibration(Calibration):
             "probability_not_monotone": estimate(float(population.probability_not_monotone)),
             "noise": {"displacement_um": estimate(self.displacement_noise_um)},
             "adjustment": {"threshold_MPa": self.adjustment.threshold_MPa, "strain": self.adjustment.strain},
-            "particles": entries,
-            "warnings": self.warnings(),
-            "findings": [one.to_json() for one in self.findings],
+            "particles": self._entries(numbers),
             "diagnostics": {
                 **NO_SAMPLER,
                 "a_objective_value": finite(self.chosen_shape.objective),
@@ -276,7 +232,9 @@ class PaperCalibration(Calibration):
                 "master_rms_MPa": self.plastic.rms_MPa,
                 "elastic_rms_strain": finite(self.elastic.rms_strain),
                 "elastic_branches": len(self.elastic.branches),
-                "relative_misfit": finite(self.relative_misfit),
+                "relative_misfit": finite(
+                    np.median([p.rms_um / max(p.range_um, 1e-300) for p in self._compared.values()])
+                ),
                 "own_misfit": finite(self.own_misfit),
             },
         }
@@ -341,33 +299,28 @@ def calibrate_paper(
         progress("fitting the effective modulus")
         eta = of_each_particle(campaign.diameters_um, lambda p: plastic_shape_factor(p, chosen.a))
         elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
-        # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
-        modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
+        modulus = RIGID_MPA if elastic.effective_modulus_MPa is None else elastic.effective_modulus_MPa
         law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
         progress("predicting every particle")
         particles = predict_particles(campaign, adjustment, law, eta)
-        noise = float(np.median([point_noise_um(curve) for curve in campaign.curves]))
+        noise = float(np.median([point_noise(curve.displacement_um) for curve in campaign.curves]))
     calibration = PaperCalibration(
-        campaign,
-        adjustment,
-        table,
-        shape,
-        shape_reference,
-        objective,
-        master,
-        plastic,
-        elastic,
-        law,
-        particles,
-        noise,
-        seed,
-        time.perf_counter() - started,
+        campaign=campaign,
+        adjustment=adjustment,
+        table=table,
+        shape=shape,
+        shape_reference=shape_reference,
+        objective=objective,
+        master=master,
+        plastic=plastic,
+        elastic=elastic,
+        mean_law=law,
+        particles=particles,
+        displacement_noise_um=noise,
+        seed=seed,
     )
-    fits = calibration._compared
-    misfit, ranges = np.array([(one.own_rms_um, one.range_um) for one in fits.values()]).reshape(-1, 2).T
-    outlying = unlike_others(list(fits), misfit, ranges)
 
-    def again(some: Campaign) -> dict[str, Any]:
+    def again(some: Campaign) -> PaperCalibration:
         return calibrate_paper(
             some,
             threshold_MPa=threshold_MPa,
@@ -376,10 +329,9 @@ def calibrate_paper(
             unloading=unloading,
             strain_scaling=strain_scaling,
             without_flagged=False,
-        ).answer()
+        )
 
-    findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
+    return calibration.judged(started, again if without_flagged else None)
 
 
 def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective, name: str | None) -> ShapeFit | None:
@@ -403,34 +355,26 @@ def predict_particles(
 
     `eta` are the shape factors of all particles, shape (N,). One entry per particle, None where it was not kept.
     """
-    kept = np.flatnonzero(adjustment.kept)
-    own = []
+    kept = np.flatnonzero(adjustment.kept).tolist()
+    factors = []
     for i in kept:
         curve = adjustment.curves[i]
         assert curve is not None
         # Residuals are relative: below a fiftieth of the peak they would be those of the force read-out.
         use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
-        own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
-    # Campaigns of similar size and length share one compilation.
-    points = [np.arange(len(campaign.curves[i])) for i in kept]
-    longest = padded_length(max(map(len, points)))
-    record, _, _ = records_of(campaign, kept.tolist(), adjustment.segments, points, longest)
-    sizes = particle_batch(campaign.diameters_um[kept])
-    C = np.array(own) ** (1 / np.array([1, 3, 5]))
+        factors.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use])[0])
+    C = np.array(factors) ** (1 / np.array([1, 3, 5]))
     mean = jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, len(kept))), law)
-    same = eqx.tree_at(lambda one: one.plastic, mean, eqx.filter_vmap(Plastic)(*jnp.asarray(C.T)))
-    blocks = Blocks(len(kept))
-    by_mean, by_own = (np.asarray(blocks.all(responses, (laws, sizes, record))) for laws in (mean, same))
+    own = eqx.tree_at(lambda one: one.plastic, mean, eqx.filter_vmap(Plastic)(*jnp.asarray(C.T)))
+    rows = [np.arange(len(campaign.curves[i])) for i in kept]
+    by_mean, by_own = responses_um(campaign, kept, adjustment.segments, rows, mean, own)
     fits: list[ParticleFit | None] = [None] * len(campaign)
     for row, i in enumerate(kept):
         curve = campaign.curves[i]
         stress, strain = stress_and_strain(curve, campaign.diameters_um[i], adjustment.segments[i])
         measured = (strain + adjustment.shift[i]) * effective_diameter_um(campaign.diameters_um[i])
-        touching = np.ones(len(curve), bool)
-        for segment in adjustment.segments[i]:
-            if segment.kind == "approach":
-                touching[segment.start : segment.stop] = False
-        used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max())) & curve.compared
+        used = (stress > max(adjustment.threshold_MPa, 0.02 * stress.max())) & curve.compared
+        used &= row_kinds(adjustment.segments[i]) != "approach"
         fits[i] = ParticleFit(
             (float(C[row, 0]), float(C[row, 1]), float(C[row, 2])),
             float(curve.displacement_um[0] - measured[0]),

@@ -14,31 +14,25 @@ from numpy.polynomial.polynomial import polyder, polyval
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from ..campaign import Adjustment, Campaign, Curve, Segment, of_each_particle, stress_and_strain
+from ..campaign import Adjustment, Campaign, Segment, of_each_particle, stress_and_strain
 from ..formulas import recovery
 from ..law import LogNormal, PlasticPopulation, StrainScaling, Unloading
 from .data import UNLOADED_FROM
 
 # ---- master curve ----------------------------------------------------------------------------------------------------
 
+GRID_POINTS = 801  # stresses at which curves are compared; no source
+
 
 @dataclass(frozen=True)
 class StrainTable:
-    r"""Every kept particle's :math:`\epsilon_i(\sigma)` on one grid of stresses.
+    r"""Every kept particle's :math:`\epsilon_i(\sigma)` on one grid of stresses."""
 
-    Attributes:
-        stress_MPa: the grid [MPa], evenly spaced from 0, shape (G,).
-        strain: strains [-], shape (n, G); 0 where a particle did not reach the stress.
-        reached: whether it did, shape (n, G).
-        flatness: 1 - D3^2 / (D1 D2) of the n particles, shape (n,).
-        index: position of the n particles in the campaign, shape (n,).
-    """
-
-    stress_MPa: np.ndarray
-    strain: np.ndarray
-    reached: np.ndarray
-    flatness: np.ndarray
-    index: np.ndarray
+    stress_MPa: np.ndarray  # the grid [MPa], evenly spaced from 0, shape (G,)
+    strain: np.ndarray  # strains [-], shape (n, G); 0 where a particle did not reach the stress
+    reached: np.ndarray  # whether it did, shape (n, G)
+    flatness: np.ndarray  # 1 - D3^2 / (D1 D2) of the n particles, shape (n,)
+    index: np.ndarray  # position of the n particles in the campaign, shape (n,)
 
     __repr__ = described()
 
@@ -52,18 +46,15 @@ class StrainTable:
         return self.reached.sum(axis=0) > len(self.index) / 5
 
 
-def strain_table(adjustment: Adjustment, diameters_um: np.ndarray, points: int = 801) -> StrainTable:
-    """Tabulate the kept loading curves by linear interpolation, on a grid of so many points.
+def strain_table(adjustment: Adjustment, diameters_um: np.ndarray) -> StrainTable:
+    """Tabulate the kept loading curves by linear interpolation, on a grid of `GRID_POINTS` stresses.
 
-    `diameters_um` are D1, D2, D3 [um] of all particles, shape (N, 3). Raises `InputError` if no particle is kept.
+    `diameters_um` are D1, D2, D3 [um] of all particles, shape (N, 3).
     """
     diameters_um = arguments.diameters(diameters_um)
-    points = arguments.whole(points, "points", least=2)
     index = np.flatnonzero(adjustment.kept)
-    if not len(index):
-        raise InputError("no particle can be used: " + "; ".join(sorted({r for r in adjustment.why_not if r})))
     curves = [c for c in adjustment.curves if c is not None and c.stress_max_MPa > adjustment.threshold_MPa]
-    grid = np.linspace(0.0, max(c.stress_max_MPa for c in curves), points)
+    grid = np.linspace(0.0, max(c.stress_max_MPa for c in curves), GRID_POINTS)
     strain = np.stack([c.at(grid) for c in curves])
     reached = ~np.isnan(strain)
     flatness = of_each_particle(diameters_um[index], lambda p: p.flatness)
@@ -78,18 +69,12 @@ class MasterCurve:
         \bar\epsilon(\sigma) = \frac{1}{\#S_\sigma} \sum_{i \in S_\sigma} \eta_{p,i}\, \epsilon_i(\sigma), \qquad
         s^2_\epsilon(\sigma) = \frac{1}{\#S_\sigma - 1} \sum_{i \in S_\sigma}
             \left[\eta_{p,i}\, \epsilon_i(\sigma) - \bar\epsilon(\sigma)\right]^2
-
-    Attributes:
-        stress_MPa: stresses [MPa], up to the largest that more than N/5 particles reach, shape (G,).
-        mean: mean master strain [-].
-        sd: its sample standard deviation; NaN where a single particle is left.
-        count: number of particles that reach the stress.
     """
 
-    stress_MPa: np.ndarray
-    mean: np.ndarray
-    sd: np.ndarray
-    count: np.ndarray
+    stress_MPa: np.ndarray  # stresses [MPa], up to the largest that more than N/5 particles reach, shape (G,)
+    mean: np.ndarray  # mean master strain [-]
+    sd: np.ndarray  # its sample standard deviation; NaN where a single particle is left
+    count: np.ndarray  # number of particles that reach the stress
 
     __repr__ = described()
 
@@ -116,36 +101,22 @@ GRID, FAR = 2000, 100.0
 
 @dataclass(frozen=True)
 class ShapeFit:
-    """A fitted shape parameter.
+    """A fitted shape parameter."""
 
-    Attributes:
-        a: the parameter [-].
-        objective: sum of squared relative deviations at `a`.
-        objective_at_zero: the same with no shape factor (a = 0), for comparison.
-        reference: position in the campaign of the reference particle; None for the full objective.
-        reason: why there is no minimum, in words; empty if there is one.
-    """
-
-    a: float
-    objective: float
-    objective_at_zero: float
-    reference: int | None
-    reason: str
+    a: float  # the parameter [-]
+    objective: float  # sum of squared relative deviations at `a`
+    objective_at_zero: float  # the same with no shape factor (a = 0), for comparison
+    reference: int | None  # position in the campaign of the reference particle; None for the full objective
+    reason: str  # why there is no minimum, in words; empty if there is one
 
     __repr__ = described()
-
-    @property
-    def converged(self) -> bool:
-        """Whether a minimum was found."""
-        return not self.reason
 
 
 def integration_weights(stress: np.ndarray, reached: np.ndarray) -> np.ndarray:
     """Trapezoidal weights of the integral over the reached part of the grid, per particle."""
-    step = stress[1] - stress[0]
-    last = reached & ~np.pad(reached[:, 1:], ((0, 0), (0, 1)))
-    weights = np.where(reached, step, 0.0)
+    weights = np.where(reached, stress[1] - stress[0], 0.0)
     weights[:, 0] /= 2
+    last = reached & ~np.pad(reached[:, 1:], ((0, 0), (0, 1)))
     return np.where(last, weights / 2, weights)
 
 
@@ -205,16 +176,14 @@ def choose_reference(table: StrainTable) -> int:
 def fit_shape_parameter(table: StrainTable, objective: Objective = "full", reference: int | None = None) -> ShapeFit:
     """Fit `a`, the value under which the particles' curves collapse on one (eqs. 13 to 15).
 
-    A fit that fails is returned with its reason.
-
     Args:
         table: strains on a common grid of stresses, of two particles at least.
         objective: "full" (eq. 14) or "reference" (eq. 15, the paper's own simplification).
         reference: position in the campaign of the reference particle; by the paper's rule (`choose_reference`) if None.
     """
-    arguments.choice(objective, get_args(Objective), "objective")
     from scipy.optimize import brentq  # half a second to import, so only where it is used
 
+    arguments.choice(objective, get_args(Objective), "objective")
     if len(table.index) < 2:
         raise InputError("the shape parameter needs at least two particles")
     stress, strain, flatness = table.stress_MPa, table.strain, table.flatness
@@ -223,27 +192,24 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
         reference = None
         quadratics = full_objective(strain, integration_weights(stress, reached), reached, flatness)
     else:
-        if reference is not None and reference not in table.index:
-            raise InputError("the reference particle was not kept")
         row = choose_reference(table) if reference is None else int(np.flatnonzero(table.index == reference)[0])
         reference = int(table.index[row])
         quadratics = reference_objective(strain, integration_weights(stress, reached & reached[row]), flatness, row)
-    alike = bool(np.ptp(flatness) <= 1e-9)
     # A shape factor that is not positive turns the particle inside out; such a minimum is none.
     most, least, far = flatness.max(), flatness.min(), FAR / max(np.abs(flatness).max(), 1e-9)
     grid = np.linspace(-1 / most if most > 0 else -far, -1 / least if least < 0 else far, GRID + 2)[1:-1]
     slope = _slope_at(grid, quadratics)
     minima = [
         float(cast(Any, brentq)(_slope_at, *grid[k : k + 2], args=(quadratics,), xtol=1e-12))
-        for k in np.flatnonzero((slope[:-1] < 0) & (slope[1:] >= 0) & (not alike))
+        for k in np.flatnonzero((slope[:-1] < 0) & (slope[1:] >= 0))
     ]
-    a, reason = min(minima, key=lambda a: objective_at(a, quadratics), default=0.0), ""
-    if alike:
+    reason = ""
+    if np.ptp(flatness) <= 1e-9:
+        minima = []
         reason = "all particles have the same D3^2/(D1 D2), so the curves do not determine the shape parameter"
     elif not minima:
-        reason = (
-            "no minimum has positive shape factors of all particles; the curves do not collapse under this shape factor"
-        )
+        reason = "no minimum has positive shape factors of all particles; the curves do not collapse under this factor"
+    a = min(minima, key=lambda a: objective_at(a, quadratics), default=0.0)
     at, at_zero = (float(objective_at(value, quadratics)) for value in (a, 0.0))
     return ShapeFit(a, at, at_zero, reference, reason)
 
@@ -256,36 +222,28 @@ SPREAD_FROM = 5.0  # thresholds from which on the spread of stress is fitted; th
 
 @dataclass(frozen=True)
 class PlasticFit:
-    r"""Population of the plastic coefficients.
+    r"""Population of the plastic coefficients."""
 
-    Attributes:
-        population: log-normal C1, C3, C5.
-        polynomial: fitted :math:`E[C_1], E[C_3^3], E[C_5^5]` [MPa].
-        rms_MPa: root mean square deviation of the fitted mean from the master curve [MPa].
-        at_bound: what ended at its lower bound, such as "C3" or "spread of C3": collapsed estimates, not measurements.
-    """
-
-    population: PlasticPopulation
-    polynomial: tuple[float, float, float]
-    rms_MPa: float
+    population: PlasticPopulation  # log-normal C1, C3, C5
+    polynomial: tuple[float, float, float]  # fitted E[C_1], E[C_3^3], E[C_5^5] [MPa]
+    rms_MPa: float  # root mean square deviation of the fitted mean from the master curve [MPa]
+    # what ended at its lower bound, such as "C3" or "spread of C3": collapsed estimates, not measurements
     at_bound: tuple[str, ...]
 
     __repr__ = described()
 
 
-def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> np.ndarray:
-    r"""Least squares for :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` with all factors > 0 [MPa], in relative stress.
+def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Least squares for :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` with all factors > 0 [MPa], in relative stress; the
+    factors, and which of them ended at their lower bound, a small share of the largest stress.
 
     Relative, since the scatter between particles grows in proportion to stress: weighing MPa alike lets the few
-    particles that reach the highest stress decide all three factors. A factor that would be negative is put at a small
-    share of the largest stress.
+    particles that reach the highest stress decide all three factors.
     """
     design = np.stack([strain, -(strain**3), strain**5], axis=1) / stress_MPa[:, None]
-    return np.maximum(_positive_least_squares(design), _smallest_factors(strain, stress_MPa))
-
-
-def _smallest_factors(strain: np.ndarray, stress: np.ndarray) -> np.ndarray:
-    return SMALLEST_SHARE * stress.max() / np.abs(strain).max() ** np.array([1, 3, 5])
+    smallest = SMALLEST_SHARE * stress_MPa.max() / np.abs(strain).max() ** np.array([1, 3, 5])
+    factors = np.maximum(_positive_least_squares(design), smallest)
+    return factors, factors <= smallest
 
 
 def _positive_least_squares(design: np.ndarray) -> np.ndarray:
@@ -323,7 +281,8 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
             "the master curve has fewer than four points of positive strain above the threshold",
             remedy="Check the sign of displacement (positive as the platens approach), or lower the threshold.",
         )
-    K1, K3, K5 = means = fit_polynomial(x, stress)
+    means, low = fit_polynomial(x, stress)
+    K1, K3, K5 = means
     variance = ((K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * sd) ** 2
     # The offset step makes all curves meet at the threshold: the spread near it is its doing, not the particles'.
     known = np.isfinite(variance) & (variance > 0) & (count > 1) & (stress >= SPREAD_FROM * threshold_MPa)
@@ -335,7 +294,6 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
         LogNormal.from_power_moments(order, jnp.asarray(mean), jnp.asarray(variance))
         for order, mean, variance in zip((1, 3, 5), means, variances, strict=True)
     )
-    low = means <= _smallest_factors(x, stress)
     names = ("C1", "C3", "C5", "spread of C1", "spread of C3", "spread of C5")
     return PlasticFit(
         PlasticPopulation(*distributions),
@@ -350,60 +308,52 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
 
 @dataclass(frozen=True)
 class ElasticBranch:
-    r"""One elastic branch: unloading from a peak and, if any, the reloading that follows, up to further virgin loading.
+    """One elastic branch: unloading from a peak and, if any, the reloading that follows, up to virgin loading."""
 
-    Attributes:
-        particle: position of the particle in the campaign.
-        strain_max: :math:`\epsilon_P` [-], with the offset step applied.
-        stress_max_MPa: :math:`\sigma_P` [MPa].
-        strain: strains along the branch [-], shape (n,).
-        stress_MPa: stresses along it [MPa], shape (n,).
-    """
-
-    particle: int
-    strain_max: float
-    stress_max_MPa: float
-    strain: np.ndarray
-    stress_MPa: np.ndarray
+    particle: int  # position of the particle in the campaign
+    strain_max: float  # epsilon_P [-], with the offset step applied
+    stress_max_MPa: float  # sigma_P [MPa]
+    strain: np.ndarray  # strains along the branch [-], shape (n,)
+    stress_MPa: np.ndarray  # stresses along it [MPa], shape (n,)
 
     __repr__ = described()
 
 
 @dataclass(frozen=True)
 class ElasticFit:
-    """A fitted effective modulus.
+    """A fitted effective modulus."""
 
-    Attributes:
-        effective_modulus_MPa: the modulus shared by all particles [MPa]; None if no branch could be used.
-        rms_strain: root mean square residual [-].
-        per_branch_MPa: the modulus that each branch alone would give [MPa].
-        branches: the branches used.
-        reason: why there is no modulus, in words; empty if there is one.
-    """
-
-    effective_modulus_MPa: float | None
-    rms_strain: float
-    per_branch_MPa: np.ndarray
-    branches: tuple[ElasticBranch, ...]
-    reason: str
+    effective_modulus_MPa: float | None  # the modulus shared by all particles [MPa]; None if no branch could be used
+    rms_strain: float  # root mean square residual [-]
+    per_branch_MPa: np.ndarray  # the modulus that each branch alone would give [MPa]
+    branches: tuple[ElasticBranch, ...]  # the branches used
+    # recovered over recoverable strain along every branch [-], its free zero taken off
+    recovered: tuple[np.ndarray, ...]
+    reason: str  # why there is no modulus, in words; empty if there is one
 
     __repr__ = described()
 
-    @property
-    def converged(self) -> bool:
-        """Whether there is a modulus."""
-        return not self.reason
-
 
 def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[ElasticBranch]:
-    """The elastic branches of every particle that the offset step kept, in its adjusted strain."""
+    """The elastic branches of every particle that the offset step kept, in its adjusted strain.
+
+    They consist of the points between `UNLOADED_FROM` and the peak, of which a branch has five at least.
+    """
     found = []
     for i in np.flatnonzero(adjustment.kept).tolist():
         curve, segments = campaign.curves[i], adjustment.segments[i]
         stress, strain = stress_and_strain(curve, campaign.diameters_um[i], segments)
         strain = strain + adjustment.shift[i]
-        branches = (_branch(i, curve, stress, strain, *each) for each in _elastic_segments(segments))
-        found += [branch for branch in branches if branch is not None]
+        for peak, rows in _elastic_segments(segments):
+            # The samples on both sides of the turning point: noise would make their maximum alone too large. One
+            # whose force was worked out has no such neighbour.
+            around = np.arange(max(peak - 1, 0), peak + 1)
+            if curve.worked_out[around].any():
+                around = around[curve.worked_out[around]]
+            top, deepest = float(stress[around].mean()), float(strain[around].max())
+            rows = rows[curve.compared[rows] & (stress[rows] > UNLOADED_FROM * top) & (stress[rows] <= top)]
+            if len(rows) >= 5 and deepest > 0 and top > 0:
+                found.append(ElasticBranch(i, deepest, top, strain[rows], stress[rows]))
     return found
 
 
@@ -420,22 +370,6 @@ def _elastic_segments(segments: tuple[Segment, ...]) -> list[tuple[int, np.ndarr
             virgin = False
             found[-1][1].append(np.arange(segment.start, segment.stop))
     return [(peak, np.concatenate(rows)) for peak, rows in found]
-
-
-def _branch(
-    particle: int, curve: Curve, stress: np.ndarray, strain: np.ndarray, peak: int, rows: np.ndarray
-) -> ElasticBranch | None:
-    """A branch of at least five points between `UNLOADED_FROM` and the peak; None of fewer."""
-    # The samples on both sides of the turning point: noise would make their maximum alone too large. One whose force
-    # was worked out has no such neighbour.
-    around = np.arange(max(peak - 1, 0), peak + 1)
-    if curve.worked_out[around].any():
-        around = around[curve.worked_out[around]]
-    top, deepest = float(stress[around].mean()), float(strain[around].max())
-    rows = rows[curve.compared[rows] & (stress[rows] > UNLOADED_FROM * top) & (stress[rows] <= top)]
-    if len(rows) < 5 or deepest <= 0 or top <= 0:
-        return None
-    return ElasticBranch(particle, deepest, top, strain[rows], stress[rows])
 
 
 def fit_effective_modulus(
@@ -457,30 +391,27 @@ def fit_effective_modulus(
     """
     branches = tuple(branches)
     if not branches:
-        return ElasticFit(None, np.nan, np.empty(0), (), "no unloading branch was measured")
-    # Strain is linear in c = E^(-1/2) of the printed form, E^-1 of a punch. The free zero of a branch is its mean.
-    power = -2 if unloading is Unloading.PRINTED else -1
+        return ElasticFit(None, np.nan, np.empty(0), (), (), "no unloading branch was measured")
+    # Recoverable strain from the measured peak, whatever the loading law, at a modulus of 1 MPa. Strain is linear in
+    # c = E^(-1/2) of the printed form, E^-1 of a punch.
+    top, deepest = np.array([(b.stress_max_MPa, b.strain_max) for b in branches]).T
+    shape = shape_factor[[b.particle for b in branches]] ** strain_scaling.power
+    if unloading is Unloading.PRINTED:
+        recoverable, power = np.sqrt(top / (unloading.constant * shape * deepest)), -2
+    else:
+        recoverable, power = top / np.sqrt(unloading.constant * shape * deepest), -1
+    released = _released(branches)
+    # The free zero of a branch is its mean.
     strain = [b.strain - b.strain.mean() for b in branches]
-    unit = _unit_recoverable(branches, shape_factor, unloading, strain_scaling)
-    slope = [u * (s.mean() - s) for u, s in zip(unit, _released(branches), strict=True)]
+    slope = [r * (s.mean() - s) for r, s in zip(recoverable, released, strict=True)]
     products = np.array([(x @ y, x @ x) for x, y in zip(slope, strain, strict=True)])
     own, c = products[:, 0] / products[:, 1], products[:, 0].sum() / products[:, 1].sum()
     alone = np.where(own > 0, own, np.nan) ** power
     if not c > 0:
-        return ElasticFit(None, np.nan, alone, branches, "strain does not fall on unloading")
+        return ElasticFit(None, np.nan, alone, branches, (), "strain does not fall on unloading")
     residual = np.concatenate(strain) - c * np.concatenate(slope)
-    return ElasticFit(float(c**power), float(np.sqrt(np.mean(residual**2))), alone, branches, "")
-
-
-def _unit_recoverable(
-    branches: Sequence[ElasticBranch], shape_factor: np.ndarray, unloading: Unloading, strain_scaling: StrainScaling
-) -> np.ndarray:
-    """Recoverable strain from the *measured* peak of each branch at a modulus of 1 MPa, whatever the loading law."""
-    top, deepest = np.array([(b.stress_max_MPa, b.strain_max) for b in branches]).T
-    shape_power = shape_factor[[b.particle for b in branches]] ** strain_scaling.power
-    if unloading is Unloading.PRINTED:
-        return np.sqrt(top / (unloading.constant * shape_power * deepest))
-    return top / np.sqrt(unloading.constant * shape_power * deepest)
+    recovered = tuple(s.mean() - x / (c * r) for s, x, r in zip(released, strain, recoverable, strict=True))
+    return ElasticFit(float(c**power), float(np.sqrt(np.mean(residual**2))), alone, branches, recovered, "")
 
 
 def _released(branches: Sequence[ElasticBranch]) -> list[np.ndarray]:
@@ -493,19 +424,3 @@ def _released(branches: Sequence[ElasticBranch]) -> list[np.ndarray]:
 
 
 _recovery = jax.jit(recovery)
-
-
-def collapsed_branches(
-    fit: ElasticFit, shape_factor: np.ndarray, unloading: Unloading, strain_scaling: StrainScaling
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Recovered over recoverable strain, and stress over peak stress, of every branch under the fitted modulus [-], its
-    free zero taken off."""
-    if fit.effective_modulus_MPa is None:
-        return []
-    power = 1 / 2 if unloading is Unloading.PRINTED else 1
-    unit = _unit_recoverable(fit.branches, shape_factor, unloading, strain_scaling) / fit.effective_modulus_MPa**power
-    found = []
-    for branch, recoverable, released in zip(fit.branches, unit, _released(fit.branches), strict=True):
-        recovered = (branch.strain_max - branch.strain) / recoverable
-        found.append((recovered - np.mean(recovered - released), branch.stress_MPa / branch.stress_max_MPa))
-    return found

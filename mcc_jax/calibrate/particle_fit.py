@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from .compiling import compiled
 from .data import Tests
@@ -27,10 +27,9 @@ snaps = compiled(jax.vmap(snap))
 
 
 class ParticleFits(eqx.Module):
-    """Where fits of single particles ended, root mean square residual [um], whether the tolerances were met."""
+    """Where fits of single particles ended, and whether the tolerances were met."""
 
     point: Point
-    rms: Float[Array, " particles"]
     converged: Bool[Array, " particles"]
 
 
@@ -161,6 +160,5 @@ def fit_particles(
     # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
     near = seen.min(0) < UNSEEN * loss.min(0) + UNSEEN
     best = np.where(near, seen, loss).argmin(0), np.arange(N)
-    rms = noise * np.sqrt(2 * loss[best] / points)
-    point, rms, converged = jax.tree.map(jnp.asarray, (at(y[best], np.arange(N)), rms, done[best]))
-    return ParticleFits(Point(*point), rms, converged)
+    point, converged = jax.tree.map(jnp.asarray, (at(y[best], np.arange(N)), done[best]))
+    return ParticleFits(Point(*point), converged)

@@ -92,8 +92,7 @@ def normal_equations(push: Callable[[Parameters], Any], residual: Any, y: Parame
         return flat(push(Parameters(jnp.broadcast_to(direction[:P], (count, P)), direction[P:])))
 
     J = jax.vmap(column, out_axes=-1)(jnp.eye(P + len(y.shared)))
-    whole = jnp.einsum("nkp,nkq->npq", J, J)
-    gradient = jnp.einsum("nkp,nk->np", J, flat(residual))
+    whole, gradient = jnp.einsum("nkp,nkq->npq", J, J), jnp.einsum("nkp,nk->np", J, flat(residual))
     return Normal(whole[:, :P, :P], whole[:, :P, P:], whole[:, P:, P:].sum(0), gradient[:, :P], gradient[:, P:].sum(0))
 
 
@@ -138,7 +137,7 @@ class Solution(eqx.Module):
     def first(self, count: int) -> Solution:
         """The same of the first `count` particles."""
         value, n = self.value._replace(local=self.value.local[:count]), self.normal
-        normal = Normal(n.local[:count], n.border[:count], n.shared, n.gradient_local[:count], n.gradient_shared)
+        normal = replace(n, local=n.local[:count], border=n.border[:count], gradient_local=n.gradient_local[:count])
         return replace(self, value=value, normal=normal, residual=jax.tree.map(lambda x: x[:count], self.residual))
 
 
@@ -163,33 +162,27 @@ def robust(loss: str, r: Values) -> Values:
     if loss == "linear":
         return r
     square = r * r
-    # Both equal r^2 - ... at 0; the quotient keeps value and derivative finite there.
     if loss == "soft_l1":
-        quotient = 2 / (jnp.sqrt(1 + square) + 1)
-    else:
-        small = square < 1e-6
-        safe = jnp.where(small, 1.0, square)
-        quotient = jnp.where(small, 1 - square / 2, jnp.log1p(safe) / safe)
-    return r * jnp.sqrt(quotient)
+        return r * jnp.sqrt(2 / (jnp.sqrt(1 + square) + 1))
+    # The quotient log(1 + r^2)/r^2 keeps value and derivative finite at 0.
+    small = square < 1e-6
+    safe = jnp.where(small, 1.0, square)
+    return r * jnp.sqrt(jnp.where(small, 1 - square / 2, jnp.log1p(safe) / safe))
 
 
 LEAST_SPREAD = 1e-4  # least standard deviation of log C in the residuals: with any smaller they are badly scaled
 
 
 class Pooled(eqx.Module):
-    """Settings of the pooled least squares.
-
-    `zero_prior` is that of the offsets from the recorded contact [um], `further` that of every further parameter of an
-    effect, of its logarithm if it is positive: mean and standard deviation each. `loss` applies to whitened residuals.
-    """
+    """Settings of the pooled least squares; priors are mean and standard deviation."""
 
     whitening: Whitening
     population: Population
-    zero_prior: Float[Array, " 2"]
-    further: Float[Array, "further 2"]
+    zero_prior: Float[Array, " 2"]  # of the offsets from the recorded contact [um]
+    further: Float[Array, "further 2"]  # of every further parameter of an effect; of its logarithm if it is positive
     forms: Forms
     scatter: Scatter = eqx.field(static=True)
-    loss: str = eqx.field(static=True, default="linear")
+    loss: str = eqx.field(static=True, default="linear")  # of whitened residuals
 
 
 SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
@@ -219,8 +212,7 @@ def pooled_residual(
     standard deviations. Weights are 1 of particles, 0 of padding."""
     scatter, at = settings.scatter, settings.population
     size = 3 + scatter.modulus
-    tau = jnp.maximum(at.tau, LEAST_SPREAD)
-    modulus = jnp.maximum(at.modulus_scatter, LEAST_SPREAD)
+    tau, modulus = (jnp.maximum(spread, LEAST_SPREAD) for spread in (at.tau, at.modulus_scatter))
     mean_zero, sd_zero = settings.zero_prior
 
     def residual(y: Parameters):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
@@ -13,20 +13,20 @@ import numpy as np
 from .. import arguments
 from .._format import first_few
 from .._types import Progress
-from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
+from ..campaign import THRESHOLD_MPA, Campaign, check_plausibility, check_tests
 from ..campaign.findings import worst
 from .compiling import imported_meanwhile, one_blas_thread
-from .data import Selection
 from .draws import Fit, draw_fast, draw_joint, effect_numbers
 from .estimates import effect_entries, finite, summary
 from .fitting import Start, checked_settings, prepare
 from .importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
-from .judgement import at_noise_level, numbers_in_reach
+from .judgement import numbers_in_reach
 from .numpyro_model import Model
 from .particles import Length
-from .population import COEFFICIENTS, Population
+from .population import COEFFICIENTS
 from .predict import data_tree, predict_measured
 from .results import PosteriorDraws
+from .sharding import block_size
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -42,12 +42,6 @@ class Posterior(PosteriorDraws):
     each chain, so every draw counts the same.
 
     Attributes:
-        campaign: the tests, checked; `campaign.raw` as they were given.
-        selection: which particles and points took part.
-        model: what was assumed.
-        fit: the joint fit it started from.
-        mode: "fast" or "joint".
-        seed, runtime_s: for the record.
         population: draws of the population.
         C: draws of every particle's C1, C3, C5, shape (chains, draws, N, 3).
         modulus_MPa: of its effective modulus.
@@ -57,6 +51,7 @@ class Posterior(PosteriorDraws):
         log_likelihood: of its whole test under each draw of the population, the particle integrated out: what
             leave-one-particle-out needs.
         pareto_k: of every particle's importance weights.
+        mode: "fast" or "joint".
         pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
             has them; None where they were not formed.
         weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
@@ -66,24 +61,11 @@ class Posterior(PosteriorDraws):
         leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
         log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
             approximation alone).
-        findings, notes: what a reader must know of the tests, of the plausibility of the answer, and of the draws.
     """
 
-    campaign: Campaign
-    selection: Selection
-    model: Model
-    fit: Fit
+    method = "bayes"
+
     mode: Mode
-    seed: int
-    runtime_s: float
-    population: Population
-    C: np.ndarray
-    modulus_MPa: np.ndarray
-    zero_um: np.ndarray
-    shape_factor: np.ndarray
-    theta: np.ndarray
-    log_likelihood: np.ndarray
-    pareto_k: np.ndarray
     pareto_k_joint: float | None
     weights_applied: bool
     divergences: int
@@ -92,8 +74,6 @@ class Posterior(PosteriorDraws):
     ess_tail: dict[str, float]
     leapfrogs: float
     log_evidence: tuple[float, float] = (np.nan, np.inf)
-    findings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
 
     def predictions(self, particle: str) -> np.ndarray | None:
         """Draws of what may be measured of a particle at its rows [um], shape (draws, rows)."""
@@ -105,7 +85,7 @@ class Posterior(PosteriorDraws):
         unfitted = [part for part, fine in parts if not fine]
         if unfitted and self.mode == "fast":  # diagnostics of draws around a fit that is none mean nothing
             by, what = self._missed, " and ".join(unfitted)
-            if at_noise_level(self.fit, self.rms_um()):
+            if self.at_noise_level():
                 return [
                     f"the search for the {what} did not come to rest, although the law misses these tests by no more "
                     f"than noise, {by}: they leave numbers of the model open; narrow the priors, or leave out an effect"
@@ -137,14 +117,8 @@ class Posterior(PosteriorDraws):
             )
         return found
 
-    @property
-    def converged(self) -> bool:
-        """Whether every gate is passed."""
-        return not self.failures()
-
-    def warnings(self) -> list[str]:
-        """What a reader of the numbers must know, one sentence each."""
-        notes = [*self.failures(), *map(str, self.findings), *self._notes_of_the_fit()]
+    def _notes(self) -> list[str]:
+        notes = super()._notes()
         count = len(self.particles)
         if count < 3:
             notes.append(f"{count} particles say little about a population: its spread is mostly the prior")
@@ -201,9 +175,7 @@ class Posterior(PosteriorDraws):
             },
         }
 
-    @cached_property
-    def content(self) -> dict[str, Any]:
-        """The contents of `calibration.json`."""
+    def _further_content(self) -> dict[str, Any]:
         named = self.named_population()
         effects = {name: summary(draws) for name, draws in effect_numbers(self.population, self.model).items()}
 
@@ -219,12 +191,7 @@ class Posterior(PosteriorDraws):
             return found
 
         return {
-            "schema": 1,
-            "method": "bayes",
             "mode": self.mode,
-            **self.answer(),
-            "runtime_s": self.runtime_s,
-            "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
             "effects": effect_entries(self.model, effects),
             "modulus_scatter": summary(named["modulus_scatter"]) if self.model.modulus_scatter else None,
@@ -233,16 +200,14 @@ class Posterior(PosteriorDraws):
             "probability_not_monotone": summary(self.probability_not_monotone()),
             "noise": self._noise_numbers() | {"factor": summary(named["noise_factor"])},
             "priors": self.model.chosen_priors.to_json(),
-            "particles": self._entries(numbers, pareto_k=self.pareto_k),
-            "warnings": self.warnings(),
-            "findings": [one.to_json() for one in self.findings],
+            "particles": self._entries_of_tests(numbers, pareto_k=self.pareto_k),
             "diagnostics": {
                 "rhat_max": finite(max(self.rhat.values())),
                 "ess_bulk_min": finite(min(self.ess_bulk.values())),
                 "ess_tail_min": finite(min(self.ess_tail.values())),
                 "divergences": self.divergences,
                 "pareto_k_max": finite(float(np.max(self.pareto_k))),
-                "pareto_k_joint": None if self.pareto_k_joint is None else finite(self.pareto_k_joint),
+                "pareto_k_joint": finite(self.pareto_k_joint),
                 "weights_applied": self.weights_applied,
                 "leapfrogs_mean": finite(self.leapfrogs),
                 "log_evidence": finite(self.log_evidence[0]),
@@ -307,22 +272,16 @@ def sample(
     fast = mode == "fast"
     with numbers_in_reach(campaign):
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
-        selection, fit, size = prepare(campaign, model, threshold_MPa, start=begin, progress=progress)
+        selection, fit = prepare(campaign, model, threshold_MPa, start=begin, progress=progress)
         progress("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         if fast:
             plausible = worst(check_plausibility(campaign)) != "error"
-            drawn = draw_fast(key, fit, length, size, fallback=plausible)
+            drawn = draw_fast(key, fit, length, block_size(len(fit.tests)), fallback=plausible)
         else:
             drawn = draw_joint(key, fit, length)
     progress("diagnosing")
-    settings: dict[str, Any] = {"mode": mode, "seed": seed}
-    found = Posterior(
-        campaign=campaign, selection=selection, model=fit.model, fit=fit, runtime_s=0.0, **settings, **drawn
-    )
-
-    def again(some: Campaign) -> dict[str, Any]:
-        more: dict[str, Any] = {"threshold_MPa": threshold_MPa, **length._asdict(), **settings}
-        return sample(some, model, without_flagged=False, **more).answer()
-
+    found = Posterior(campaign=campaign, selection=selection, model=fit.model, fit=fit, seed=seed, mode=mode, **drawn)
+    settings = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed, **length._asdict()}
+    again = partial(sample, model=model, without_flagged=False, **settings)
     return found.judged(started, again if without_flagged else None)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -16,14 +16,14 @@ from .._archive import encode, read_archive
 from .._errors import InputError
 from .._format import table
 from .._store import json_text, results
-from ..campaign import Campaign, read_campaign
+from ..campaign import Campaign, Curve, Finding, read_campaign
 from ..effects import Variant
 from ..law import MccLaw
-from .curves import FittedCurve, fitted_curves
-from .data import Selection, compared_rows, ranges_um, root_mean_squares
+from .curves import FittedCurve, fitted_curves, law_of
+from .data import Selection, ranges_um, root_mean_squares
 from .draws import Fit, named_population
-from .estimates import estimate, finite, force_zero, law_of, log_estimate, quantities
-from .judgement import judged, misfit_note, noise_note, noise_share, unlike_others
+from .estimates import estimate, finite, log_estimate, normal_estimate, quantities
+from .judgement import CORRELATED_SHARE, LARGE_MISFIT, judged, unlike_others
 from .numpyro_model import Model
 from .population import COEFFICIENTS, Population
 
@@ -66,12 +66,24 @@ class Saved:
         return content
 
 
+@dataclass(frozen=True, repr=False, kw_only=True)
 class Calibration(Saved):
-    """A calibration of any method: `law`, `curves`, `save`; `mcc_jax.load` reads what was saved."""
+    """A calibration of any method: `law`, `curves`, `save`; `mcc_jax.load` reads what was saved.
+
+    Attributes:
+        campaign: the tests, checked; `campaign.raw` as they were given.
+        seed, runtime_s: for the record; only a posterior is random.
+        findings: what a reader must know of the tests and of the plausibility of the answer.
+    """
 
     content_file, archive_file = CONTENT, ARCHIVE
     archived: ClassVar[tuple[str, ...]] = ("curves",)  # saved with the fields, so that they are not worked out again
+    method: ClassVar[str]
+
     campaign: Campaign
+    seed: int = 0
+    runtime_s: float = 0.0
+    findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
         content = self.to_json()
@@ -83,6 +95,91 @@ class Calibration(Saved):
         rows.append(("law", f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}"))
         rows += [("warning", text[:100]) for text in content.get("warnings", [])]
         return table(title, rows)
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """The contents of `calibration.json`."""
+        return {
+            "schema": 1,
+            "method": self.method,
+            **self.answer(),
+            "runtime_s": self.runtime_s,
+            "seed": self.seed,
+            **self._further_content(),
+            "warnings": self.warnings(),
+            "findings": [one.to_json() for one in self.findings],
+        }
+
+    @property
+    def converged(self) -> bool:
+        """Whether the numbers may be used."""
+        return not self.failures()
+
+    def warnings(self) -> list[str]:
+        """What a reader of the numbers must know, one sentence each."""
+        notes = [*self.failures(), *map(str, self.findings), *self._notes(), *self.misfit_notes()]
+        if dropped := sum(reason is not None for reason in self.why_not):
+            notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
+        return notes
+
+    def failures(self) -> list[str]:
+        """Why the result must not be called converged, and what to do; empty if it may."""
+        raise NotImplementedError
+
+    def answer(self) -> dict[str, Any]:
+        """Whether it converged, a and the modulus, as in `calibration.json`."""
+        raise NotImplementedError
+
+    @property
+    def why_not(self) -> tuple[str | None, ...]:
+        """Why each particle of the campaign took no part; None if it did."""
+        raise NotImplementedError
+
+    def _own_residuals(self) -> tuple[Sequence[str], np.ndarray, np.ndarray]:
+        """Names of the particles that are compared, root mean square residual with their own coefficients and range of
+        displacement [um]."""
+        raise NotImplementedError
+
+    @property
+    def own_misfit(self) -> float:
+        """Median over the particles of that residual, in shares of the range of displacement [-]."""
+        _, rms, ranges = self._own_residuals()
+        return float(np.median(rms / np.maximum(ranges, 1e-300)))
+
+    def misfit_notes(self) -> list[str]:
+        """A sentence if the law describes the tests badly even with each particle's own coefficients, else none."""
+        if not self.own_misfit > LARGE_MISFIT:
+            return []
+        return [
+            "even with its own C1, C3, C5 the law misses a test's displacements by "
+            f"{100 * self.own_misfit:.0f} % of their range (median): "
+            "either it describes these tests badly, or they are not compressions of single particles"
+        ]
+
+    def _notes(self) -> list[str]:
+        """What else a reader must know."""
+        raise NotImplementedError
+
+    def _further_content(self) -> dict[str, Any]:
+        """The entries of `calibration.json` that differ from method to method."""
+        raise NotImplementedError
+
+    def judged(self, started: float, again: Callable[[Campaign], Calibration] | None) -> Any:
+        """The same with findings, see `judgement.judged`, and the time it took since it was started.
+
+        `again` calibrates the campaign without the particles that are flagged; None to report no answers without them.
+        """
+        answer_without = None if again is None else lambda some: again(some).answer()
+        findings = judged(self.campaign, self.answer(), unlike_others(*self._own_residuals()), answer_without)
+        return replace(self, findings=findings, runtime_s=time.perf_counter() - started)
+
+    def _entries(self, numbers: Callable[[int], dict[str, Any]]) -> list[dict[str, Any]]:
+        """Entries of all particles in files, from the numbers of each by its place in the campaign."""
+        parts = zip(self.campaign.particles, self.campaign.curves, self.why_not, strict=True)
+        return [
+            {"particle": name, **numbers(i), "kept": why is None, "why_not": why, "force_zero_mN": _force_zero(curve)}
+            for i, (name, curve, why) in enumerate(parts)
+        ]
 
     def summary(self) -> pd.DataFrame:
         """Value, standard deviation and ends of the 95 % interval (columns) of the law's parameters (rows); NaN if
@@ -126,14 +223,14 @@ class Calibration(Saved):
         return None
 
 
+@dataclass(frozen=True, repr=False, kw_only=True)
 class JointCalibration(Calibration):
-    """A calibration of all particles at once, which began with a fit; see `LeastSquares` and `Posterior`."""
+    """A calibration of all particles at once, which began with a fit."""
 
-    campaign: Campaign
-    selection: Selection
-    model: Model
-    fit: Fit
-    notes: tuple[str, ...]
+    selection: Selection  # which particles and points took part
+    model: Model  # what was assumed
+    fit: Fit  # the joint fit it started from
+    notes: tuple[str, ...] = ()  # what else a reader must know
 
     @property
     def variants(self) -> dict[str, Variant]:
@@ -147,7 +244,9 @@ class JointCalibration(Calibration):
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
         """Rows of every particle's curve that are in the tests, and which of them are compared."""
-        return compared_rows(self.selection)
+        mask = np.asarray(self.selection.tests.mask)
+        both = zip(self.selection.kept, self.selection.rows, mask, strict=True)
+        return {place: (rows, used[: len(rows)]) for place, rows, used in both}
 
     def residual(self) -> np.ndarray:
         """Measured less predicted displacement [um] at the most probable parameters, shape (N, points), 0 where
@@ -158,20 +257,13 @@ class JointCalibration(Calibration):
         """Root mean square residual of every particle [um], shape (N,)."""
         return root_mean_squares(self.selection.tests, self.residual())
 
-    def judged(self, started: float, again: Callable[[Campaign], Mapping[str, Any]] | None) -> Any:
-        """The same with findings, see `judgement.judged`, and the time it took since it was started."""
-        outlying = unlike_others(self.particles, self.rms_um(), ranges_um(self.selection.tests))
-        findings = judged(self.campaign, self.answer(), outlying, again)
-        return replace(cast(Any, self), findings=findings, runtime_s=time.perf_counter() - started)
-
-    def answer(self) -> dict[str, Any]:
-        """Whether it converged, a and the modulus, as in `calibration.json`."""
-        raise NotImplementedError
+    def _own_residuals(self) -> tuple[Sequence[str], np.ndarray, np.ndarray]:
+        return self.particles, self.rms_um(), ranges_um(self.selection.tests)
 
     @property
-    def own_misfit(self) -> float:
-        """Median over the particles of `rms_um`, in shares of the range of displacement [-]."""
-        return float(np.median(self.rms_um() / np.maximum(ranges_um(self.selection.tests), 1e-300)))
+    def why_not(self) -> tuple[str | None, ...]:
+        """Why each particle of the campaign took no part; None if it did."""
+        return self.selection.why_not
 
     @property
     def _missed(self) -> str:
@@ -180,15 +272,35 @@ class JointCalibration(Calibration):
 
     @property
     def noise_share(self) -> float:
-        """Share of what the law misses that correlated noise has taken up; see `noise_share`."""
-        return noise_share(self.fit)
+        """Share of the residual variance that the fit attributes to correlated noise [-].
 
-    def _notes_of_the_fit(self) -> list[str]:
-        """Warnings about the tests, about how they were calibrated, and about what the law misses."""
-        notes = [*self.selection.notes, *self.notes]
-        notes += filter(None, (misfit_note(self.own_misfit), noise_note(self.noise_share, self._missed)))
-        dropped = sum(reason is not None for reason in self.selection.why_not)
-        return notes + [f"{dropped} of {len(self.campaign)} particles could not be used"] * (dropped > 0)
+        Read-out and force noise is white: what is correlated along a test and no smaller is rather what the law misses.
+        """
+        variance, correlated = self._variances()
+        return float(np.median(correlated / variance))
+
+    def at_noise_level(self) -> bool:
+        """Whether what the law misses is mostly white noise of read-out and force: correlated noise and a common factor
+        on the noise, which grow with a misfit, do not count."""
+        variance, correlated = self._variances()
+        return bool(np.median((1 - CORRELATED_SHARE) * self.rms_um() ** 2 - (variance - correlated)) <= 0)
+
+    def _variances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean variance of every test's noise [um^2], and of its correlated part."""
+        noise, mask = self.fit.noise.noise, np.asarray(self.fit.tests.mask)
+        variance = np.where(mask, np.asarray(self.fit.filters.solver.matrix.diag.d), 0.0).sum(1)
+        correlated = (np.asarray(noise.scale) * float(noise.correlated)) ** 2
+        return variance / np.maximum(mask.sum(1), 1), correlated
+
+    def _notes(self) -> list[str]:
+        notes, share = [*self.selection.notes, *self.notes], self.noise_share
+        if share > CORRELATED_SHARE:
+            notes.append(
+                f"the law misses displacements by {self._missed}; {100 * share:.0f} % of that is correlated along a "
+                "test: more likely something that the law lacks than noise of the instrument; mcc_jax.discover looks "
+                "for what it is"
+            )
+        return notes
 
     def _noise_numbers(self) -> dict[str, Any]:
         """Estimates of the noise by their names in files."""
@@ -197,28 +309,33 @@ class JointCalibration(Calibration):
         numbers = zip(names, np.asarray(noise.noise.logs), noise.log_sd, strict=True)
         return {name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0) for name, m, s in numbers}
 
-    def _entries(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
-        """Entries of every particle in files, from estimates of a row of the tests and further values of all rows."""
+    def _entries_of_tests(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
+        """The same from estimates of a row of the tests, and further values of all rows."""
         row_of = {i: row for row, i in enumerate(self.selection.kept)}
         further = {"rms_um": self.rms_um(), "noise_scale": np.asarray(self.fit.noise.noise.scale)} | more
-        nothing: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
-        return [
-            {
-                "particle": name,
-                **(nothing if (row := row_of.get(i)) is None else numbers(row)),
-                **{key: None if row is None else finite(float(values[row])) for key, values in further.items()},
-                "kept": row is not None,
-                "why_not": self.selection.why_not[i],
-                "force_zero_mN": force_zero(self.campaign.curves[i]),
-            }
-            for i, name in enumerate(self.campaign.particles)
-        ]
+        nothing = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None)) | dict.fromkeys(further)
+
+        def of_particle(i: int) -> dict[str, Any]:
+            row = row_of.get(i)
+            if row is None:
+                return nothing
+            return numbers(row) | {key: finite(values[row]) for key, values in further.items()}
+
+        return self._entries(of_particle)
 
 
+def _force_zero(curve: Curve) -> dict[str, Any]:
+    """The zero of force [mN] that was taken off a test; null where no reading before contact shows it."""
+    checked = curve.checked
+    if checked is None or not (checked.force_zero_mN or checked.force_zero_sd_mN):
+        return estimate(None)
+    return normal_estimate(checked.force_zero_mN, checked.force_zero_sd_mN)
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
 class PosteriorDraws(JointCalibration):
     """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
 
-    seed: int
     population: Population
     C: np.ndarray
     modulus_MPa: np.ndarray

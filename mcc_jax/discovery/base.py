@@ -99,13 +99,13 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress
     """
     with numbers_in_reach(campaign):
         model, foreign = in_own_units(campaign, model)
-        selection, fit, _ = prepare(campaign, model, threshold_MPa, progress=progress)
+        selection, fit = prepare(campaign, model, threshold_MPa, progress=progress)
         share = np.median(root_mean_squares(fit.tests, fit.residual) / ranges_um(fit.tests))
         coarse = foreign is not None and bool(share > DECISIONS.foreign_misfit)
         if coarse:
             branches = int(np.median([len(find_segments(curve)) for curve in campaign.curves]))
             most = DECISIONS.readings * branches
-            selection, fit, _ = prepare(campaign, model, threshold_MPa, most_points=most, progress=progress)
+            selection, fit = prepare(campaign, model, threshold_MPa, most_points=most, progress=progress)
     p = fit.population
     shift = np.mean(np.log1p(np.asarray(p.a) * np.asarray(fit.tests.flatness)))
     population = jnp.asarray(np.concatenate([[p.a, p.log_modulus], np.asarray(p.mu) + shift]))

@@ -11,7 +11,8 @@ import numpy as np
 from .._errors import InputError
 from .._format import described, table
 from ..calibrate import Model, Posterior
-from ..calibrate.estimates import estimate, finite, law_of
+from ..calibrate.curves import law_of
+from ..calibrate.estimates import estimate, finite
 from ..calibrate.results import DISCOVERY_ARCHIVE, Calibration, Saved
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
@@ -281,5 +282,5 @@ class Discovery(Saved):
             "ess_bulk_min": finite(min(posterior.ess_bulk.values())),
             "divergences": posterior.divergences,
             "pareto_k_max": finite(float(np.max(posterior.pareto_k))),
-            "pareto_k_joint": None if posterior.pareto_k_joint is None else finite(posterior.pareto_k_joint),
+            "pareto_k_joint": finite(posterior.pareto_k_joint),
         }

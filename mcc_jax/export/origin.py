@@ -16,7 +16,8 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from ..calibrate.estimates import entry_of, exponential
+from ..calibrate.curves import entry_of
+from ..calibrate.estimates import exponential
 from ..calibrate.population import COEFFICIENTS
 from ..calibrate.results import ARCHIVE, load
 from ..campaign import Campaign, read_diameters

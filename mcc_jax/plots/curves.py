@@ -189,8 +189,8 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     if any(calibration.curves[i].why_not for i in chosen):
         handles.append(_NOT_USED)
     title = "Measured and predicted" + (f", page {page} of {pages}" if pages > 1 else "")
-    warnings = list(filter(None, [calibration.misfit_note]))
-    return style.finish(figure, calibration.campaign, title=title, warnings=warnings, handles=handles)
+    notes = calibration.misfit_notes()
+    return style.finish(figure, calibration.campaign, title=title, warnings=notes, handles=handles)
 
 
 @style.styled

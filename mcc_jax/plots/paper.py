@@ -15,7 +15,7 @@ from matplotlib.ticker import ScalarFormatter
 from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ..calibrate.data import UNLOADED_FROM
-from ..calibrate.paper_steps import MasterCurve, collapsed_branches
+from ..calibrate.paper_steps import MasterCurve
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style
@@ -335,15 +335,13 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
         for ax in (left, right):
             style.empty(ax, fit.reason or "no effective modulus")
         return style.finish(figure, calibration.campaign)
-    every_eta = style.shape_factors(calibration)
-    eta = every_eta[[b.particle for b in fit.branches]]
+    eta = style.shape_factors(calibration)[[b.particle for b in fit.branches]]
     colours = style.sequential(eta)
     rgba = colours.to_rgba(eta)
     few = len(fit.branches) <= style.THIN_CURVES
     dots: style.Look = {"markersize": 3 if few else 1.8, "alpha": 0.7 if few else 0.35, "markeredgewidth": 0}
-    branches = collapsed_branches(fit, every_eta, law.unloading, law.strain_scaling)
-    for (recovered, ratio), colour in zip(branches, rgba, strict=True):
-        left.plot(recovered, ratio, ".", color=colour, **dots)
+    for branch, recovered, colour in zip(fit.branches, fit.recovered, rgba, strict=True):
+        left.plot(recovered, branch.stress_MPa / branch.stress_max_MPa, ".", color=colour, **dots)
     s = np.linspace(0.0, 1.0, 201)
     ratio = np.asarray(jax.jit(stress_ratio)(jnp.asarray(s)))
     left.plot(s, ratio, color=style.BLACK, linewidth=1.0, label="law, $f(s)$")

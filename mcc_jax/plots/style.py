@@ -180,10 +180,8 @@ def finish_joint(
     figure: Figure, calibration: Posterior | LeastSquares, title: str, handles: Sequence[Artist] = ()
 ) -> Figure:
     """`finish` for a joint calibration, with the first reason not to rely on its numbers below the title."""
-    if isinstance(calibration, Posterior):
-        reasons = calibration.failures()
-    else:
-        reasons = [calibration.reason] if calibration.reason else []
+    reasons = calibration.failures()
+    if isinstance(calibration, LeastSquares):
         reasons += [f"the data leave this combination open: {text}" for text in calibration.identifiability.open]
     warnings = []
     if reasons:

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, simulated, true_coefficients
 
-from mcc_jax import (
-    Campaign,
-    Curve,
-    InputError,
-    Programme,
-    Ramp,
-    least_squares,
-    sample,
-)
+from mcc_jax import Campaign, Curve, InputError, Programme, Ramp, least_squares, sample
 from mcc_jax.calibrate.data import select
 
 pytestmark = pytest.mark.extended
@@ -116,7 +108,6 @@ def test_every_particle_has_numbers_or_a_reason(campaign, contents, method):
     kept = tuple(p["particle"] for p in content["particles"] if p["kept"])
     assert kept == KEPT
     why = {p["particle"]: p["why_not"] for p in content["particles"]}
-    assert "MPa" in why["weak"]
     assert "threshold of 0.2 MPa" in why["weak"]
     assert why["noise"]
     assert why["nothing"]
@@ -211,12 +202,7 @@ def test_two_particles_of_one_shape(method, ratios):
         assert content["a"]["sd"] > 0.5
 
 
-@methods
-def test_no_usable_particle_is_told_by_name(method):
+def test_no_usable_particle_is_named():
     weak = joined(one("feather", 0, peak_MPa=0.1), one("dust", 1, peak_MPa=0.15))
-    with pytest.raises(InputError) as error:
-        METHODS[method](weak)
-    told = str(error.value)
-    assert "'feather'" in told
-    assert "'dust'" in told
-    assert "0.2 MPa" in told
+    with pytest.raises(InputError, match=r"'feather'.*0\.2 MPa.*'dust'"):
+        select(weak)

@@ -11,7 +11,7 @@ from joint_cases import NOISE, simulated, true_coefficients
 from scipy.optimize import least_squares as scipy_least_squares
 
 from mcc_jax import Curve, Programme, least_squares, paper_campaign
-from mcc_jax.calibrate.pooled_fit import Parameters, pooled_residual, robust
+from mcc_jax.calibrate.pooled_fit import Parameters, minimise, pooled_residual, robust
 
 # Eight particles in every test: one compilation.
 KEEP = np.arange(20) < 8
@@ -134,6 +134,27 @@ def test_the_covariance_is_that_of_scipy_s_jacobian(result, by_scipy):
 
 
 # ---- what the data leave open ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("max_steps", [100, 2])
+def test_a_parameter_without_data_stays_where_it_is(max_steps):
+    """Decays of their own height and level, with a rate and a drift that all share; and two steps are not enough."""
+    time, rng = np.linspace(0.0, 2.0, 12), np.random.default_rng(5)
+    local = 1 + rng.random((4, 2))
+    decays = local[:, :1] * np.exp(-1.3 * time) + local[:, 1:] + 0.2 * time**2 + 0.05 * rng.standard_normal((4, 12))
+
+    def residual(y):
+        model = y.local[:, :1] * jnp.exp(-y.shared[0] * time)[None] + y.local[:, 1:2] + (y.shared[1] * time**2)[None]
+        return (decays - model,)
+
+    start = Parameters(jnp.ones((4, 3)).at[:, 2].set(7.0), jnp.asarray([0.5, 0.0, -3.0]))
+    found = jax.jit(lambda y: minimise(residual, y, max_steps=max_steps))(start)
+    assert bool(found.converged) is (max_steps > 2)
+    np.testing.assert_array_equal(found.value.local[:, 2], 7.0)
+    assert float(found.value.shared[2]) == -3.0
+    for block in found.normal.covariance():
+        assert np.all(np.isfinite(np.asarray(block)))
 
 
 @pytest.mark.extended

@@ -8,35 +8,23 @@ from mcc_jax.calibrate import compiling
 from mcc_jax.calibrate.compiling import make_room
 
 
-@pytest.fixture
-def traced():
-    """A compiled function and how often it was traced."""
-    count = []
+@pytest.mark.skipif(not compiling.MAPS.exists(), reason="only Linux limits memory maps, and shows them")
+@pytest.mark.parametrize(("limit", "times"), [("10\n", 2), (f"{10**9}\n", 1), ("", 1), ("many", 1), (None, 1)])
+def test_compiled_functions_are_forgotten_near_a_known_limit_only(monkeypatch, tmp_path, limit, times):
+    traced = []
 
     @jax.jit
     def function(x):
-        count.append(1)
+        traced.append(1)
         return x + 1
 
     function(jnp.zeros(3))
-    return function, count
-
-
-@pytest.mark.skipif(not compiling.MAPS.exists(), reason="only Linux limits memory maps, and shows them")
-@pytest.mark.parametrize(("limit", "times"), [("10\n", 2), (f"{10**9}\n", 1), ("", 1), ("many", 1)])
-def test_compiled_functions_are_forgotten_near_a_known_limit_only(traced, monkeypatch, tmp_path, limit, times):
-    function, count = traced
     file = tmp_path / "max_map_count"
-    file.write_text(limit)
-    monkeypatch.setattr(compiling, "MAX_MAPS", file)
+    if limit is None:  # no maps are shown
+        monkeypatch.setattr(compiling, "MAPS", file)
+    else:
+        file.write_text(limit)
+        monkeypatch.setattr(compiling, "MAX_MAPS", file)
     make_room()
     assert function(jnp.ones(3)).tolist() == [2, 2, 2]
-    assert len(count) == times
-
-
-def test_nothing_happens_where_no_maps_are_shown(traced, monkeypatch, tmp_path):
-    function, count = traced
-    monkeypatch.setattr(compiling, "MAPS", tmp_path / "none")
-    make_room()
-    function(jnp.ones(3))
-    assert len(count) == 1
+    assert len(traced) == times

@@ -17,7 +17,7 @@ from mcc_jax.calibrate.noise import (
     Noise,
     Whitening,
     estimate_noise,
-    likelihoods,
+    grams_and_likelihoods,
     particle_scales,
     whitening,
 )
@@ -133,18 +133,6 @@ def test_draws_have_the_covariance_of_the_density(kind):
     np.testing.assert_allclose(covariance, dense(FOUR, 1.0, tests, linear, kind=kind)[used][:, used], rtol=1e-6)
 
 
-@pytest.mark.extended
-def test_masked_points_count_for_nothing():
-    rng = np.random.default_rng(1)
-    tests, linear = random_tests(rng, masked=0.4, zero_sd=0.2)
-    one, two = rng.standard_normal((2, 1, POINTS))
-    other = np.where(np.asarray(tests.mask), one, two)
-    values = (found_density(FOUR, np.ones(1), 1.0, tests, linear, v, KINDS[0]) for v in (one, other))
-    np.testing.assert_array_equal(*values)
-    filtered = jax.tree.map(lambda x: x[0], filters(FOUR, jnp.ones(1), tests, linear, *KINDS[0]))
-    assert np.abs(np.asarray(filtered(linear.residual[0][:, None]))[~np.asarray(tests.mask[0])]).max() < 1e-5
-
-
 def test_white_noise_only_divides_and_a_display_reads_in_steps():
     rng = np.random.default_rng(2)
     tests, linear = random_tests(rng, masked=0.0)
@@ -158,13 +146,17 @@ def test_white_noise_only_divides_and_a_display_reads_in_steps():
 # ---- numbers integrated out, and the noise estimated -----------------------------------------------------------------
 
 
+def likelihoods(scale, tests, linear, logs, zero_sd=2.0):
+    return grams_and_likelihoods(scale, tests, linear, logs, jnp.asarray(zero_sd), *KINDS[0])[1]
+
+
 @pytest.mark.extended
 @pytest.mark.parametrize("scale", [1.0, 0.6])
 def test_restricted_likelihood_is_the_dense_normal_one_with_the_numbers_in_the_covariance(scale):
     rng = np.random.default_rng(0)
     tests, linear = random_tests(rng, count=2)
     noise, zero_sd = Noise.of(FOUR, jnp.asarray([scale, 1.0])), 1.5
-    actual = likelihoods(noise.scale, tests, linear, noise.logs[None], jnp.asarray(zero_sd), *KINDS[0])[:, 0]
+    actual = likelihoods(noise.scale, tests, linear, noise.logs[None], zero_sd)[:, 0]
     for i in range(2):
         mask = np.asarray(tests.mask[i])
         X = np.concatenate([np.asarray(linear.columns[i]), np.full((POINTS, 1), zero_sd)], 1)
@@ -202,7 +194,7 @@ def known_tests(four, scale):
 
 def estimate(tests, linear, start, **options):
     def log_likelihoods(logs):
-        return likelihoods(start.scale, tests, linear, logs, jnp.asarray(2.0), *KINDS[0])
+        return likelihoods(start.scale, tests, linear, logs)
 
     return estimate_noise(log_likelihoods, WEAK, start, **options)
 
@@ -229,7 +221,7 @@ def test_the_estimate_is_the_maximum_and_its_volume_laplace_s(estimated):
     tests, linear, start, found = estimated
 
     def loss(logs):
-        each = likelihoods(start.scale, tests, linear, jnp.asarray(logs)[None], jnp.asarray(2.0), *KINDS[0])
+        each = likelihoods(start.scale, tests, linear, jnp.asarray(logs)[None])
         return -(float(jnp.sum(each)) + float(WEAK.log_density(logs)))
 
     best = np.asarray(found.noise.logs)

@@ -2,8 +2,9 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -63,12 +64,16 @@ def write(folder, **changes):
     return folder
 
 
+def campaign():
+    return SimpleNamespace(particles=tuple(SIZES), diameters_um=np.array(list(SIZES.values()), float))
+
+
 @dataclass(frozen=True, repr=False)
 class Numbers(Calibration):
     """Stands in for a saved calibration: what `write` wrote."""
 
     content: dict
-    campaign = SimpleNamespace(particles=tuple(SIZES), diameters_um=np.array(list(SIZES.values()), float))
+    campaign: Any = field(default_factory=campaign, kw_only=True)
 
 
 def stand_in(folder):

@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from reading_figures import check_layout, check_words, panels, texts
 
 from mcc_jax import plots
-from mcc_jax.calibrate.paper_steps import ElasticFit, collapsed_branches
+from mcc_jax.calibrate.paper_steps import ElasticFit
 from mcc_jax.campaign import Metadata
 from mcc_jax.plots import (
     paper_figures,
@@ -30,7 +30,6 @@ from mcc_jax.plots import (
     save_figures,
 )
 from mcc_jax.plots.paper import adjusted_curve, dimensions, law_strain, stretches_outside
-from mcc_jax.plots.style import shape_factors
 
 KINDS = ["paper", "cycles", "two", "dropped"]
 
@@ -313,12 +312,12 @@ def test_a_law_that_misses_the_data_is_said_so(calibrations):
 def test_elastic_branches_collapse(calibration):
     left, right = panels(plot_elastic(calibration))
     fit = calibration.elastic
-    law = calibration.mean_law
-    branches = collapsed_branches(fit, shape_factors(calibration), law.unloading, law.strain_scaling)
-    assert len(branches) == len(fit.branches)
-    assert len(left.lines) == len(branches) + 2
+    assert len(left.lines) == len(fit.branches) + 2
+    ratios = (b.stress_MPa / b.stress_max_MPa for b in fit.branches)
     curve = line(left, "law, $f(s)$")
-    off = np.concatenate([s - np.interp(-r, -curve.get_ydata(), curve.get_xdata()) for s, r in branches])
+    off = np.concatenate(
+        [s - np.interp(-r, -curve.get_ydata(), curve.get_xdata()) for s, r in zip(fit.recovered, ratios, strict=True)]
+    )
     assert np.sqrt(np.mean(off**2)) < 0.03  # the noise of the read-out over a few um of recovery
     np.testing.assert_allclose(right.collections[0].get_offsets()[:, 1], fit.per_branch_MPa / 1e3)
     assert right.lines[0].get_ydata()[0] == pytest.approx(fit.effective_modulus_MPa / 1e3)
@@ -350,7 +349,7 @@ def test_residuals(calibration):
 
 def test_what_is_missing_is_said(paper):
     """No unloading, no offset step, no shape parameter, a single shape."""
-    elastic = ElasticFit(None, np.nan, np.empty(0), (), "no unloading branch was measured")
+    elastic = ElasticFit(None, np.nan, np.empty(0), (), (), "no unloading branch was measured")
     r = dataclasses.replace(
         paper,
         elastic=elastic,
