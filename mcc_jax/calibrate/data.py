@@ -26,7 +26,7 @@ from ..campaign import (
     stress_and_strain,
     turning_forces,
 )
-from ..campaign.adjustment import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ..campaign.adjustment import SHOWN, far_apart, no_curve, no_loading, refusal
 from ..campaign.findings import named
 from ..campaign.record import humidities, record_columns
 from ..campaign.segments import contact_index
@@ -42,7 +42,6 @@ UNLOADED_FROM = 0.05
 # without any, of a simulation say, is small but not nothing.
 READING_UM = 2e-4
 LEAST_POINTS = 12  # fewer usable points cannot carry three coefficients, a zero and their noise
-CLIMB = 8.0  # displacement must grow over loading by this many times its noise, or there is no curve to fit
 # Of records with more segments than one for so many rows that are kept, hundreds of cycles, whole cycles are left out:
 # turning points that are always kept would be most of what is left.
 TURNS_SHARE = 4
@@ -285,16 +284,10 @@ def _prepare(
     elastic &= peak > 0
     hidden = bool(elastic.any() and not elastic[compared].any())
     loading, elastic = loading & compared, elastic & compared
-    if stress.max() <= threshold:
-        return below_threshold(float(stress.max()), threshold)
-    if loading.sum() < LEAST_POINTS:
-        return too_few(int(loading.sum()), LEAST_POINTS)
-    climb = curve.displacement_um[rows[loading]]
-    third = max(len(climb) // 3, 1)
-    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise(curve.displacement_um), READING_UM)
-    least = CLIMB * noise / np.sqrt(third)
-    if rise <= least:
-        return no_climb(float(rise) if rise >= 0 or rise < -least else 0.0)
+    climb, noise = curve.displacement_um[rows[loading]], max(point_noise(curve.displacement_um), READING_UM)
+    reason = no_curve(climb, float(stress.max()), threshold, least_points=LEAST_POINTS, noise_um=noise)
+    if reason is not None:
+        return reason
     contact, mask = float(curve.displacement_um[contact_index(segments)]), loading | elastic
     return _Prepared(rows, mask, loading, contact, float(at[mask].max()), float(np.ptp(strain[rows][mask])), hidden)
 

@@ -26,6 +26,7 @@ LEAST_LEVELS = 2  # a loading curve of fewer points above the threshold has no c
 FEW_FORCES = 5  # a record with no more different forces shows steps of its read-out, not a curve of three coefficients
 # Factor in stress and strain within which tests on one material end: the paper's end between 7 and 16 MPa
 FAR_APART = 100.0
+CLIMB = 8.0  # displacement must grow over loading by this many standard errors of its noise
 SHOWN = 3  # particles that an error names with their reasons, at most
 
 
@@ -172,14 +173,9 @@ def _why_not(
     """Why a test cannot be used; None if it can."""
     if loading is None:
         return no_loading(curve, segments, stress_and_strain(curve, diameters_um, segments)[0], threshold_MPa)
-    if loading.stress_max_MPa <= threshold_MPa:
-        return below_threshold(loading.stress_max_MPa, threshold_MPa)
     strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]
-    if len(strain) < LEAST_LEVELS:
-        return too_few(len(strain), LEAST_LEVELS)
-    third = max(len(strain) // 3, 1)
-    rise = float(strain[-third:].mean() - strain[:third].mean())
-    return None if rise > 0 else no_climb(rise * effective_diameter_um(diameters_um))
+    climb_um = strain * effective_diameter_um(diameters_um)
+    return no_curve(climb_um, loading.stress_max_MPa, threshold_MPa, least_points=LEAST_LEVELS)
 
 
 def _reason(sentence: str, remedy: str) -> Finding:
@@ -209,17 +205,32 @@ def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarr
     return _reason("has no loading: force never rises above its noise", f"{column} leave the particle out")
 
 
-def no_climb(rise_um: float) -> Finding:
-    """Why a test has no loading curve although it loads: its displacement does not grow, by `rise_um` [um]."""
-    if rise_um == 0:
-        what = "displacement stays the same while force grows"
-        remedy = "check that the right column is taken as displacement, or leave the particle out"
-    elif rise_um < 0:
-        what = f"displacement falls by {-rise_um:.3g} um while force grows"
+def no_curve(
+    climb_um: np.ndarray, stress_max_MPa: float, threshold_MPa: float, *, least_points: int, noise_um: float = 0.0
+) -> Finding | None:
+    """Why a test that loads has no curve that a law could be compared with; None if it has one.
+
+    `climb_um` is its displacement along the loading that counts, shape (n,), and must grow beyond its noise.
+    """
+    if stress_max_MPa <= threshold_MPa:
+        return below_threshold(stress_max_MPa, threshold_MPa)
+    if len(climb_um) < least_points:
+        what = f"has {len(climb_um)} usable points on loading, fewer than {least_points}"
+        return _reason(what, "record loading with more readings, or lower the threshold")
+    third = max(len(climb_um) // 3, 1)
+    rise = float(climb_um[-third:].mean() - climb_um[:third].mean())
+    least = CLIMB * noise_um / np.sqrt(third)
+    if rise > least:
+        return None
+    if rise > 0:
+        what = f"displacement grows with force by {rise:.3g} um only, not beyond its noise"
+        remedy = "check the unit and the column of displacement, or leave the particle out"
+    elif rise < -least:
+        what = f"displacement falls by {-rise:.3g} um while force grows"
         remedy = "reverse the sign of displacement: it must grow as the platens approach each other"
     else:
-        what = f"displacement grows with force by {rise_um:.3g} um only, not beyond its noise"
-        remedy = "check the unit and the column of displacement, or leave the particle out"
+        what = "displacement stays the same while force grows"
+        remedy = "check that the right column is taken as displacement, or leave the particle out"
     return _reason(f"shows no loading curve: {what}", remedy)
 
 
@@ -228,12 +239,6 @@ def below_threshold(stress_MPa: float, threshold_MPa: float) -> Finding:
     what = f"reaches {stress_MPa:.3g} MPa only, not the threshold of {threshold_MPa:g} MPa"
     remedy = "check the unit of force and the diameters (they turn force into stress), or lower the threshold"
     return _reason(what, remedy)
-
-
-def too_few(points: int, least: int) -> Finding:
-    """Why a loading curve is too short."""
-    what = f"has {points} usable points on loading, fewer than {least}"
-    return _reason(what, "record loading with more readings, or lower the threshold")
 
 
 _APART = (
