@@ -80,7 +80,6 @@ def examples(folder: Path) -> list[Example]:
         Example(mcc.Curve, time_s=curve.time_s, force_mN=curve.force_mN, displacement_um=curve.displacement_um),
         Example(mcc.Campaign, particles=["a"], diameters_um=np.full((1, 3), 100.0), curves=[curve]),
         Example(mcc.campaign.Metadata, control="load", force_resolution_mN=0.1, punch_diameter_um=500.0),
-        Example(mcc.campaign.Segment, kind="load", start=0, stop=4),
         Example(mcc.campaign.find_segments, curve=tests.curves[0], control="load"),
         Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
         Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes),

@@ -137,18 +137,18 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch, number):
     assert snapshot(tmp_path) == {"a": b"a"}
 
 
-def test_one_file_is_replaced_when_it_is_complete(tmp_path):
+def test_one_file_is_replaced_when_it_is_complete(tmp_path, monkeypatch):
     file = tmp_path / "state"
-    file.write_text("old")
+    write_file(file, b"old")
 
-    def half(stream):
-        stream.write(b"ha")
-        raise ValueError("planted")
+    def full(_):
+        raise OSError("planted")
 
-    with pytest.raises(ValueError, match="planted"):
-        write_file(file, half)
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="planted"):
+        patch.setattr(os, "fsync", full)
+        write_file(file, b"new")
     assert snapshot(tmp_path) == {"state": b"old"}
-    write_file(file, lambda stream: stream.write(b"new"))
+    write_file(file, b"new")
     assert snapshot(tmp_path) == {"state": b"new"}
 
 
