@@ -144,10 +144,11 @@ def test_one_file_is_replaced_when_it_is_complete(tmp_path, monkeypatch):
     def full(_):
         raise OSError("planted")
 
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="planted"):
-        patch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="planted"):
         write_file(file, b"new")
     assert snapshot(tmp_path) == {"state": b"old"}
+    monkeypatch.undo()
     write_file(file, b"new")
     assert snapshot(tmp_path) == {"state": b"new"}
 
