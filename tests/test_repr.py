@@ -77,7 +77,6 @@ def some():
         "model": mcc.Model().with_effects("creep", "frame_compliance"),
         "priors": mcc.Priors(),
         "decisions": discovery.DECISIONS,
-        "plan": mcc.discovery.Plan("a plan", [mcc.Programme.cycles()]),
         "packing": dem.spheres(law, np.array([100.0, 120.0]), density=1540.0),
         "walls": dem.die(1e-3, 2e-3)[-1],
         "motion": dem.Motion.of(time_step=1e-8, drag=0.0),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -35,6 +35,7 @@ ACCEPT = 0.99
 # that is near normal takes 15 leapfrog steps a draw; one that needs over 31 would take minutes, and shows in R-hat.
 FALLBACK_ACCEPT, TREE_DEPTH = 0.95, 5
 DEFAULT_DEPTH = 10  # NumPyro's
+INDEPENDENT = {"divergences": 0, "leapfrogs": 0.0}  # of draws without a sampler
 
 
 class Fit(eqx.Module):
@@ -93,13 +94,10 @@ class Fit(eqx.Module):
     def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
         """NumPyro's NUTS for the model, from the mode on, in coordinates in which the covariance there is the identity.
 
-        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
-        every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
-        they mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`.
-
-        Args:
-            explicit: sample every particle's own numbers.
-            settings: of `numpyro.infer.NUTS`.
+        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. With
+        `explicit`, every particle's own numbers are sampled under the exact likelihood, in coordinates in which they
+        mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`. Settings are those of
+        `numpyro.infer.NUTS`.
         """
         from numpyro.infer import NUTS, init_to_value
 
@@ -116,24 +114,30 @@ def exact_likelihood(fit: Fit) -> ExactLikelihood:
 
 
 def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: bool) -> dict[str, Any]:
-    """The population sampled, the particles drawn back and corrected by exact weights.
-
-    Without `fallback`, and where the fit did not converge, NUTS never runs, which takes minutes there: the draws are
-    then those of the proposal.
-    """
-    exact = exact_likelihood(fit)
-    population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    many = are_many(len(fit.tests), length)
-    fallback = fallback and bool(np.all(np.asarray(fit.converged)[1:]))
-    run, good, (integral, error) = _sampled(population_key, fit, length, many, fallback)
+    """The population sampled, the particles drawn back and corrected by exact weights. NUTS takes over from poor
+    weights only with `fallback` and of a fit that converged: else it would take minutes."""
+    exact, target, many = exact_likelihood(fit), fit.target, are_many(len(fit.tests), length)
+    population_key, *keys = jax.random.split(key, 4)
+    shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
+    drawn = sample_weighted(population_key, fit.mode, fit.covariance, target, **shape)
+    population, good, integral, error, nuts = drawn.population, drawn.good, drawn.log_evidence, drawn.error, INDEPENDENT
+    if not good:  # the integral by Laplace's method
+        volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(fit.covariance))[1] + len(target.signed()) * np.log(2)
+        integral, error = float(log_densities(np.asarray(fit.mode)[None], target)[0] + volume), np.inf
+        if fallback and np.all(fit.converged[1:]):
+            coordinates = FitCoordinates(fit, explicit=False)
+            position, nuts = _nuts(population_key, coordinates, length, FALLBACK_ACCEPT, TREE_DEPTH)
+            population = jax.tree.map(np.asarray, populations(jax.vmap(coordinates.free)(position), target))
+            good = True
+    given = exact, block, population, length, keys
     if many:
-        parameters = _stack(run.population, fit, length)[1].reshape(length.total, -1)
-        found = corrected(exact, block, run.population, parameters, length, check_key, pick_key, particle_key)
+        found = corrected(*given, _stack(population, fit, length)[1].reshape(length.total, -1))
     else:
-        found = weighted(exact, block, run.population, length, check_key, pick_key)
-    run = run._replace(population=some_of(run.population, found.chosen))
+        found = weighted(*given)
+    population = some_of(population, found.chosen)
     value = integral + found.log_ratio[0] + float(fit.noise.log_evidence)
-    return _collected(run, found.particles[:4], fit, length, found.keep) | {
+    return _collected(population, found.particles[:4], fit, length, found.keep) | {
+        **nuts,
         "pareto_k": found.k,
         "pareto_k_joint": found.k_joint if good else np.inf,
         "weights_applied": not many,
@@ -142,46 +146,18 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: boo
     }
 
 
-class Run(NamedTuple):
-    """Draws of the population, chains in a row, divergences, and leapfrog steps a draw (0 of independent draws)."""
-
-    population: Any
-    divergences: int = 0
-    leapfrogs: float = 0.0
-
-
-def _sampled(key: Array, fit: Fit, length: Length, many: bool, fallback: bool) -> tuple[Run, bool, tuple[float, float]]:
-    """Draws of the population, independent and weighted if the weights are good enough, else NUTS's; whether they are
-    good; and the log of the density's integral with its standard error, by Laplace's method where NUTS drew."""
-    target = fit.target
-    found = sample_weighted(key, fit.mode, fit.covariance, target, chains=length.chains, draws=length.draws, many=many)
-    if found.good:
-        return Run(found.population), True, (found.log_evidence, found.error)
-    volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(fit.covariance))[1] + len(target.signed()) * np.log(2)
-    laplace = float(log_densities(np.asarray(fit.mode)[None], target)[0]) + float(volume), np.inf
-    if not fallback:
-        return Run(found.population), False, laplace
-    coordinates = FitCoordinates(fit, explicit=False)
-    position, run = _nuts(key, coordinates, length, FALLBACK_ACCEPT, TREE_DEPTH)
-    population = jax.tree.map(np.asarray, populations(jax.vmap(coordinates.free)(position), target))
-    return run._replace(population=population), True, laplace
-
-
 def draw_joint(key: Array, fit: Fit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together by NumPyro's NUTS under the exact likelihood."""
     coordinates = FitCoordinates(fit, explicit=True)
-    position, run = _nuts(key, coordinates, length, ACCEPT, DEFAULT_DEPTH)
+    position, nuts = _nuts(key, coordinates, length, ACCEPT, DEFAULT_DEPTH)
     population, *particles = jax.tree.map(np.asarray, _explicit(position, coordinates))
     unweighted = {"pareto_k": np.zeros(len(fit.tests)), "pareto_k_joint": None, "weights_applied": False}
-    return _collected(run._replace(population=population), particles, fit, length) | unweighted
+    return _collected(population, particles, fit, length) | unweighted | nuts
 
 
 class FitCoordinates(eqx.Module):
     """The model's density in the coordinates of a fit, near standard normal: widths over five powers of ten do not mix.
-
-    With `exact`, every particle has its random effects, in the coordinates of its Laplace approximation and under the
-    exact likelihood; else they are integrated out.
-    """
+    With `exact`, every particle has its random effects, under the exact likelihood; else they are integrated out."""
 
     target: LogPosterior
     mode: Array
@@ -244,21 +220,20 @@ def _explicit(positions: Array, coordinates: FitCoordinates) -> tuple[Any, ...]:
     return jax.lax.map(one, positions)
 
 
-def _nuts(key: Array, coordinates: FitCoordinates, length: Length, accept: float, depth: int) -> tuple[Array, Run]:
-    """Draws of the coordinates by NUTS, all chains in a row, and a run without its populations."""
+def _nuts(
+    key: Array, coordinates: FitCoordinates, length: Length, accept: float, depth: int
+) -> tuple[Array, dict[str, float]]:
+    """Draws of the coordinates by NUTS, all chains in a row; divergences, and leapfrog steps a draw."""
     keys = jax.random.split(key, length.chains)
     z, divergent, steps = _chains(keys, coordinates, length.warmup, length.draws, accept, depth)
-    return z.reshape(-1, coordinates.size), Run(None, int(np.sum(divergent)), float(np.mean(steps)))
+    return z.reshape(-1, coordinates.size), {"divergences": int(np.sum(divergent)), "leapfrogs": float(np.mean(steps))}
 
 
 @compiled
 def _chains(
     keys: Array, coordinates: FitCoordinates, warmup: int, draws: int, accept: float, depth: int
 ) -> tuple[Array, Array, Array]:
-    """Draws of all chains, which diverged, and leapfrog steps.
-
-    A function of the data, compiled once for a shape: NumPyro's `MCMC` compiles again for every data set.
-    """
+    """Draws of all chains, which diverged, and leapfrog steps. NumPyro's `MCMC` compiles for every data set."""
     from numpyro.infer import NUTS
 
     def potential(z: Array) -> Array:
@@ -283,22 +258,19 @@ def _chains(
         return jax.vmap(chain)(keys)
 
 
-def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1) -> dict[str, Any]:
+def _collected(population: Population, particles: Any, fit: Fit, length: Length, keep: int = 1) -> dict[str, Any]:
     """What the draws of both modes have in common; of the population every `keep`-th draw of each chain."""
 
-    def shaped(x: Any) -> np.ndarray:
-        return np.asarray(x).reshape(length.chains, length.draws, *x.shape[1:])[:, ::keep]
+    def by_chain(x: Any) -> np.ndarray:
+        return np.reshape(x, (length.chains, len(x) // length.chains, *x.shape[1:]))
 
-    count = len(fit.tests)
-    population = jax.tree.map(shaped, run.population)
-    eta = 1 + np.asarray(population.a)[..., None] * np.asarray(fit.marginal.flatness)
+    rhat, bulk, tail = diagnostics(*_stack(population, fit, length))
+    kept = jax.tree.map(lambda x: by_chain(x)[:, ::keep], population)
+    latent, theta, zero, likelihood = (by_chain(np.asarray(x)) for x in particles)
+    eta = 1 + kept.a[..., None] * np.asarray(fit.marginal.flatness)
     log_eta = np.log(eta)
-    latent, theta, zero, likelihood = (
-        np.reshape(x, (length.chains, len(x) // length.chains, count, *x.shape[2:])) for x in map(np.asarray, particles)
-    )
-    rhat, bulk, tail = diagnostics(*_stack(run.population, fit, length))
     return {
-        "population": population,
+        "population": kept,
         # What scatter of `a` there is has gone into b alone; a particle's coefficients are those under the common a.
         "C": np.exp(latent[..., :3] - log_eta[..., None]),
         "modulus_MPa": np.exp(latent[..., 3] - fit.model.shape_power * log_eta),
@@ -306,11 +278,9 @@ def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1
         "shape_factor": eta,
         "theta": theta,
         "log_likelihood": likelihood,
-        "divergences": run.divergences,
         "rhat": rhat,
         "ess_bulk": bulk,
         "ess_tail": tail,
-        "leapfrogs": run.leapfrogs,
     }
 
 

@@ -17,7 +17,7 @@ from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from ..campaign.signal import point_noise
 from .compiling import compiled, make_room
 from .data import MOST_POINTS, Selection, Tests, select
-from .draws import Fit
+from .draws import Fit, coordinates_of
 from .forward import Linear, Point, linearise
 from .linearisation import Linearisation
 from .marginal import Summaries, summarise
@@ -125,7 +125,8 @@ class _Fitter:
         self.individual = self.alone(white, point.theta, own[:, None])
         self.point, self.linear = point, self.linearisation.at(point)
         one = jax.tree.map(lambda x: np.asarray(x)[None], start.population)
-        values = population_sites(self.model, np.asarray(self.tests.flatness), one).values
+        known = coordinates_of(one, self.model)
+        values = population_sites(self.model, np.asarray(self.tests.flatness), known).values
         return {name: float(value[0]) for name, value in values.items()}
 
     def begin(self, read_out_um: float) -> dict[str, float]:

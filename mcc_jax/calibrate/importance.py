@@ -1,14 +1,10 @@
 r"""Independent draws of the population, by adaptive importance sampling.
 
 With the particles integrated out the population's posterior has seven to eleven coordinates, in which it is nearly
-normal. So instead of following gradients along trajectories, independent draws :math:`\theta_s` of a Student
-distribution around the mode are weighted,
-
-.. math:: w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)
-
-and one distribution more is fitted to all weighted draws, q the mixture of all so far, until the weights' Pareto k and
-effective size say that they are good enough (adaptive multiple importance sampling, Cornuet et al. 2012; Vehtari et al.
-2024). If they never do, NUTS has to run, which takes four times as long to compile.
+normal. Independent draws :math:`\theta_s` of a Student distribution around the mode are weighted by
+:math:`w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)`, and one distribution more is fitted to all weighted
+draws, q the mixture of all so far, until the weights' Pareto k and effective size are good enough (adaptive multiple
+importance sampling, Cornuet et al. 2012; Vehtari et al. 2024). Else NUTS has to run, four times as long to compile.
 """
 
 from __future__ import annotations
@@ -46,11 +42,8 @@ PROPOSED = 1.5
 
 
 class Weighted(NamedTuple):
-    """Draws of the population by importance resampling, in unbounded coordinates and as populations, chains in a row.
-
-    `good` says whether their weights are good enough, `log_evidence` is the logarithm of the density's integral, of the
-    mean weight, and `error` its standard error.
-    """
+    """Draws of the population in unbounded coordinates and as populations, chains in a row; whether their weights are
+    good enough; the logarithm of the density's integral and its standard error."""
 
     free: np.ndarray
     population: Population
@@ -65,11 +58,8 @@ def sample_weighted(
     """Draws of the population by importance resampling; of the first proposal alone if no weights are good enough.
 
     A spread's coordinate may have either sign for the same spread: proposals and draws are folded to positive ones.
-
-    Args:
-        mode, covariance: of the population in unbounded coordinates.
-        chains, draws: shape of what is returned; each chain is resampled from its own proposals.
-        many: propose no more than is kept: a density is expensive.
+    Each chain is resampled from its own proposals; of `many` particles no more is proposed than is kept, as a density
+    is expensive.
     """
     from scipy.special import logsumexp
 
@@ -153,10 +143,7 @@ def _factor(covariance: np.ndarray) -> np.ndarray:
 
 
 class _Mixture:
-    """Draws of one Student distribution after another, all weighted by the mixture of them.
-
-    `log_weight` is the log density less that of the mixture, in the parts that each distribution has of the draws.
-    """
+    """Draws of one Student distribution after another, all weighted by the mixture of them."""
 
     def __init__(self, seed: np.ndarray, target: LogPosterior) -> None:
         from scipy.stats import multivariate_t
@@ -164,7 +151,8 @@ class _Mixture:
         self._rng, self._target = np.random.default_rng(seed), target
         self._spreads = np.array(target.signed())
         d = len(target.names)
-        self._signs = np.array(list(product((1.0, -1.0), repeat=len(self._spreads))))
+        self._signs = np.ones((2 ** len(self._spreads), d))  # all choices
+        self._signs[:, self._spreads] = list(product((1.0, -1.0), repeat=len(self._spreads)))
         # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix for singular.
         shape = cast(Any, np.eye(d) * (1 - 2 / FREEDOM))  # its stub takes a number
         self._unit = multivariate_t(np.zeros(d), shape, FREEDOM)
@@ -201,25 +189,12 @@ class _Mixture:
         return self._log_density + twice - mixture
 
     def _proposal(self, free: np.ndarray, centre: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Log density of a distribution, given the inverse of its covariance's factor."""
-        away = 1 + self._squares(free, centre, inverse) / (FREEDOM - 2)
+        """Log density of a distribution, folded, given the inverse of its covariance's factor."""
+        white = ((free * signs - centre) @ inverse.T for signs in self._signs)
+        away = 1 + np.stack([np.einsum("nd,nd->n", z, z) for z in white]) / (FREEDOM - 2)
         least, power = away.min(0), 0.5 * (FREEDOM + len(inverse))
         density = np.log(((least / away) ** power).sum(0)) - power * np.log(least)
         return self._constant + density + np.sum(np.log(np.diagonal(inverse)))
-
-    def _squares(self, free: np.ndarray, centre: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Squared distances from the centre in units of the distribution, one row for each choice of signs.
-
-        Changing the sign of x_i adds -2 x_i k_i to the whitened z, k_i the i-th column of the inverse factor: the
-        square changes by -4 x_i (z . k_i) each and 4 x_i x_j (k_i . k_j) for each pair.
-        """
-        columns, own = inverse[:, self._spreads], free[:, self._spreads]
-        white = (free - centre) @ inverse.T
-        products = (own[:, :, None] * own[:, None, :] * (columns.T @ columns)).reshape(len(free), -1)
-        flipped = (1 - self._signs) / 2
-        pairs = (flipped[:, :, None] * flipped[:, None, :]).reshape(len(flipped), -1)
-        alike = np.einsum("nd,nd->n", white, white)
-        return np.maximum(alike + 4 * (pairs @ products.T - flipped @ (own * (white @ columns)).T), 0.0)
 
 
 def _tempered(log_weight: np.ndarray, enough: int) -> np.ndarray | None:
@@ -269,8 +244,7 @@ def relative_scatter(log_weight: np.ndarray) -> np.ndarray:
 
 
 def smoothed(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Pareto-smoothed log weights that add up to 1, and their k: infinite, and unsmoothed, where no tail can be fitted,
-    0 where all are equal."""
+    """Pareto-smoothed log weights that add up to 1, and their k: infinite if no tail can be fitted, 0 if all equal."""
     from arviz_stats.base.array import array_stats
 
     finite = np.where(np.isfinite(log_weight), log_weight, -1e10)
@@ -289,10 +263,9 @@ def pareto_k(log_weight: np.ndarray) -> np.ndarray:
 
 
 def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Pareto-smoothed importance weights, normalised, and their k."""
+    """Pareto-smoothed importance weights that add up to 1, and their k."""
     smooth, k = smoothed(log_weight)
-    weight = np.exp(np.maximum(smooth - np.max(smooth), -700.0))
-    return weight / weight.sum(), k
+    return np.exp(smooth), k
 
 
 def effective_share(weight: np.ndarray) -> float:

@@ -11,10 +11,8 @@ and, where an effect differs from particle to particle, :math:`A_i = A e^{\tau \
 signs are physical), is integrated out by Laplace's method. The Gram matrix is a quadratic not in w, but in the
 coefficients of the stress's polynomial, :math:`\kappa_j = (e^{j (b_j - \hat b_j)} - 1)/j`, and in the amplitudes,
 because the prediction is nearly linear in these and the ridges of the likelihood are straight. Deviations, not
-coefficients, are the variables, so everything stays regular when a spread is exactly 0: there is no funnel.
-
-References:
-    Margossian et al. (2020), Hamiltonian Monte Carlo using an adjoint-differentiated Laplace approximation.
+coefficients, are the variables, so everything stays regular when a spread is exactly 0: there is no funnel (Margossian
+et al. 2020, Hamiltonian Monte Carlo using an adjoint-differentiated Laplace approximation).
 """
 
 from __future__ import annotations
@@ -28,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar
 from .compiling import compiled
 from .data import Tests
 from .forward import Linear, Point, snap
@@ -51,29 +48,18 @@ class Marginal(eqx.Module):
 
     with :math:`\lambda` the population's `log_noise`. The zero given u is normal around `zero + zero_slope u` with
     standard deviation `zero_sd` (times the noise factor).
-
-    Attributes:
-        point: around what.
-        straight: coordinates of the effects' numbers.
-        gram: G, shape (N, Q, Q); the residual is its last column.
-        log_scale: L: noise's determinant and the zero's integral.
-        count: n, number of points.
-        zero, zero_slope, zero_sd: distribution of the zero [um].
-        flatness: 1 - D3^2/(D1 D2) of every particle [-].
-        weight: 1 for particles, 0 for padding; None where all are particles.
-        scatter: what differs from particle to particle.
     """
 
     point: Point
-    straight: Straight
-    gram: Float[Array, "particles q q"]
-    log_scale: Float[Array, " particles"]
-    count: Float[Array, " particles"]
+    straight: Straight  # coordinates of the effects' numbers
+    gram: Float[Array, "particles q q"]  # G, of which the residual is the last column
+    log_scale: Float[Array, " particles"]  # L: noise's determinant and the zero's integral
+    count: Float[Array, " particles"]  # n, number of points
     zero: Float[Array, " particles"]
     zero_slope: Float[Array, "particles u"]
     zero_sd: Float[Array, " particles"]
-    flatness: Float[Array, " particles"]
-    weight: Float[Array, " particles"] | None
+    flatness: Float[Array, " particles"]  # 1 - D3^2/(D1 D2)
+    weight: Float[Array, " particles"] | None  # 1 for particles, 0 for padding; None where all are particles
     scatter: Scatter
 
     def log_likelihood(self, population: Population) -> Float[Array, " particles"]:
@@ -121,28 +107,22 @@ class Marginal(eqx.Module):
             _, gradient, curvature = expand(at, population, xi, share)
             return xi - Cholesky(curvature + eye).solve(xi + gradient)
 
-        def start() -> Array:
-            # The linear solution: slopes at the point, not at the population's mean, which may lie far away.
-            none = jnp.zeros((len(self.flatness), self.scatter.size))
-            mean = self.place(population, none)
-            away = jnp.concatenate([mean.latent - self.point.latent, mean.u[:, 4:]], 1)
-            _, factor = moments(population, self.flatness, self.scatter)
-            jacobian = mean.jacobian.at[:, :4, : factor.shape[-1]].set(factor)
-            precision, score = self.gram[:, :-1, :-1], self.gram[:, :-1, -1]
-            pull = score - jnp.einsum("npq,nq->np", precision, away)
-            curvature = share * jnp.einsum("npk,npq,nql->nkl", jacobian, precision, jacobian)
-            return Cholesky(curvature + eye).solve(share * jnp.einsum("npk,np->nk", jacobian, pull))
-
-        xi = start()
+        # The linear solution: slopes at the point, not at the population's mean, which may lie far away.
+        mean = self.place(population, jnp.zeros((len(self.flatness), self.scatter.size)))
+        away = jnp.concatenate([mean.latent - self.point.latent, mean.u[:, 4:]], 1)
+        _, factor = moments(population, self.flatness, self.scatter)
+        jacobian = mean.jacobian.at[:, :4, : factor.shape[-1]].set(factor)
+        precision, score = self.gram[:, :-1, :-1], self.gram[:, :-1, -1]
+        pull = score - jnp.einsum("npq,nq->np", precision, away)
+        curvature = share * jnp.einsum("npk,npq,nql->nkl", jacobian, precision, jacobian)
+        xi = Cholesky(curvature + eye).solve(share * jnp.einsum("npk,np->nk", jacobian, pull))
         if self.scatter.newton:
             # Found without derivatives; one last step with them carries the derivative of the whole iteration.
-            fixed, held, frozen = jax.lax.stop_gradient((self, population, share))
-            xi = jax.lax.fori_loop(
-                0, self.scatter.newton, lambda _, x: newton(fixed, held, x, frozen), jax.lax.stop_gradient(xi)
-            )
+            fixed, held, frozen, xi = jax.lax.stop_gradient((self, population, share, xi))
+            xi = jax.lax.fori_loop(0, self.scatter.newton, lambda _, x: newton(fixed, held, x, frozen), xi)
             xi = newton(self, population, xi, share)
         placed, _, curvature = expand(self, population, xi, share)
-        border = jnp.concatenate([placed.u, -jnp.ones((len(self.flatness), 1))], 1)
+        border = jnp.pad(placed.u, ((0, 0), (0, 1)), constant_values=-1.0)
         squares = jnp.einsum("np,npq,nq->n", border, self.gram, border)
         stretch = self.stretch(population)
         # In straightened coordinates the likelihood is quadratic; what bends is the prior: xi^2/2 has the curvature
@@ -180,8 +160,7 @@ class Marginal(eqx.Module):
 def with_products(
     u: Float[Array, "particles u"], jacobian: Float[Array, "particles u k"]
 ) -> tuple[Float[Array, "particles q"], Float[Array, "particles q k"]]:
-    """Coordinates with their products: of each of an effect's with all, half of it where both are an effect's, in the
-    order of `Linear.bends`; and the derivatives."""
+    """Coordinates with the products of each effect's with all, in the order of `Linear.bends`, and derivatives."""
     half = jnp.concatenate([jnp.ones(4), jnp.full(u.shape[1] - 4, 0.5)])[None]
     own, own_slope = u[:, 4:], jacobian[:, 4:]
     products = own[:, :, None] * (half * u)[:, None, :]
@@ -216,11 +195,8 @@ class Laplace(eqx.Module):
 
 
 class ParticleDraw(NamedTuple):
-    """One draw of all particles given the population: w, parameters of effects, zeros [um], deviations xi.
-
-    `log_volume` is the log determinant of the map from standard normal numbers to xi and zero, minus infinity outside
-    its range; `log_likelihood` that of each test, integrated.
-    """
+    """One draw of all particles given the population. `log_volume` is the log determinant of the map from standard
+    normal numbers to deviations and zero; `log_likelihood` that of each test, integrated."""
 
     latent: Float[Array, "particles 4"]
     theta: Float[Array, "particles numbers"]
@@ -239,8 +215,7 @@ def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"]
 
 
 class Summaries(NamedTuple):
-    """The tests summarised, the filters of their noise, and its effective standard deviation [um]: white noise of that
-    size would weigh a test as much."""
+    """The tests summarised, their noise's filters, and the sd of white noise [um] that would weigh a test as much."""
 
     marginal: Marginal
     filters: Whitening
@@ -259,23 +234,18 @@ def summarise(
     correlation: Correlation,
     along: Along,
 ) -> Summaries:
-    """Summarise all tests around a point by Gauss-Newton curvature, from the derivatives in the coordinates `straight`.
+    """Summarise all tests around a point by Gauss-Newton curvature, from the derivatives in the coordinates `straight`;
+    `zero_prior` is mean and sd of the zeros' distance from the recorded contact [um]."""
 
-    `zero_prior` is that of the zeros' distance from the recorded contact, mean and standard deviation [um].
-    """
-
-    def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:
-        return whitening(noise, scale, tests, linear, correlation, along)
-
-    filters = jax.vmap(of_one)(noise.scale, tests, linear)
+    whiten = jax.vmap(lambda scale, one, linear: whitening(noise, scale, one, linear, correlation, along))
+    filters = whiten(noise.scale, tests, linear)
     ones = jnp.where(tests.mask, 1.0, 0.0)
     bends = [] if linear.bends is None else [linear.bends]
     columns = jnp.concatenate([linear.columns, *bends, ones[..., None], linear.residual[..., None]], -1)
     white = jax.vmap(lambda f, x: f(x))(filters, columns)
     gram = jnp.einsum("nkp,nkq->npq", white, white)
-    slope, offset, weight = jax.vmap(_snap_evidence)(
-        point.latent, tests.particle, tests.force, tests.mask & tests.loading
-    )
+    used = tests.mask & tests.loading
+    slope, offset, weight = jax.vmap(_snap_evidence)(point.latent, tests.particle, tests.force, used)
     seen = jnp.concatenate([slope, jnp.zeros((len(tests), gram.shape[-1] - 5)), offset[:, None]], 1)
     gram += weight[:, None, None] * seen[:, :, None] * seen[:, None, :]
     # It bounds where a particle may go, and is no datum: at the point itself it costs nothing.
@@ -289,19 +259,8 @@ def summarise(
     at = (gram[:, place, -1] + precision[:, 0] * away) / total
     points, log_det = jax.vmap(lambda f: (f.points, f.log_det))(filters)
     log_scale = log_integral - 0.5 * (log_det + float(np.log(2 * np.pi)) * jnp.sum(ones, 1))
-    marginal = Marginal(
-        point=point,
-        straight=straight,
-        gram=left,
-        log_scale=log_scale,
-        count=points - 1,
-        zero=point.zero + at,
-        zero_slope=slopes,
-        zero_sd=1 / jnp.sqrt(total),
-        flatness=tests.flatness,
-        weight=None,
-        scatter=scatter,
-    )
+    zero = point.zero + at, slopes, 1 / jnp.sqrt(total)
+    marginal = Marginal(point, straight, left, log_scale, points - 1, *zero, tests.flatness, None, scatter)
     information = jax.vmap(lambda f: f.information)(filters)
     return Summaries(marginal, filters, jnp.sqrt(points / jnp.maximum(information, 1e-30)))
 
@@ -309,10 +268,9 @@ def summarise(
 def _snap_evidence(latent, particle, force, used):
     """Evidence of a jump that no residual has: the curve's peak lies between the two forces around it.
 
-    The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point of the
-    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, takes its place:
-    returned are the derivative of that logarithm by the latent vector, the distance of the interval's middle from it,
-    and its precision, zero unless the test shows a jump.
+    The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point. A
+    normal distribution of the log of the force at the peak, as wide as the interval, takes its place: its derivative by
+    the latent vector, the distance of the interval's middle from it, and its precision, zero without a jump.
     """
     value, slope = jax.value_and_grad(snap)(latent, particle)
     at = jnp.where(jnp.isfinite(value), jnp.exp(jnp.where(jnp.isfinite(value), value, 0.0)), jnp.inf)

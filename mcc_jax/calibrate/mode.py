@@ -120,8 +120,8 @@ def _unconstrained(values: Float[Array, " d"], target: LogPosterior) -> Float[Ar
 
 
 class Expected(eqx.Module):
-    """The particles' `mean` and `sd` of b1, b3, b5, e, `theta_mean` and `theta_sd` of the amplitudes that vary, under a
-    population; their most probable `latent`, `theta` and `zero` [um] given the tests; the rest as in `Laplace`."""
+    """The particles under a population, mean and sd of b1, b3, b5, e and of the amplitudes that vary; their most
+    probable parameters given the tests; the rest as in `Laplace`."""
 
     mean: Float[Array, "particles 4"]
     sd: Float[Array, "particles 4"]
@@ -151,8 +151,8 @@ def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
 
 
 def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
-    """The target without Newton steps in the integration over the particles, if every coefficient of the first `count`
-    of them, those that are no padding, is known sharply; else as it is."""
+    """The target without Newton steps in the integration over the particles, if every coefficient of the first `count`,
+    which are no padding, is known sharply; else as it is."""
     scatter = replace(target.marginal.scatter, newton=0)
     sharp = replace(target, marginal=replace(target.marginal, scatter=scatter))
     at = expect(free, sharp)
@@ -195,8 +195,7 @@ def most_probable(
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
     """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
 
-    Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. Where the density
-    has no curvature that is a number, even at the start, the covariance is not one either.
+    Newton's method in a trust region, scaled by the curvature at the start; without one the covariance is not a number.
     """
     origin = np.asarray(start)
     width = np.full(len(origin), 1e-5)
@@ -204,18 +203,14 @@ def most_probable(
     if not all(np.isfinite(part).all() for part in (value, slope, curvature)):
         return jnp.asarray(origin), jnp.asarray(np.full_like(curvature, np.nan)), False
     success = False
-    # Where data are very exact the scales at the start are far from those at the mode: then again from there.
-    for attempt in range(ATTEMPTS):
-        if attempt:
-            _, _, curvature = expanded(origin, width, target)
+    for _ in range(ATTEMPTS):
         unit = _scales(curvature)
         width = DIFFERENCE * np.minimum(unit, 1.0)
         found = _newton(origin, unit, width, target)
-        origin = origin + unit * found.x
-        success = bool(found.success)
+        origin, success = origin + unit * found.x, bool(found.success)
+        _, slope, curvature = expanded(origin, width, target)
         if success:
-            break
-    _, slope, curvature = expanded(origin, width, target)
+            break  # else scales at the start were far from those at the mode, of very exact data: again from there
     # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
     scale = _scales(curvature)
     values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
@@ -233,10 +228,8 @@ def _scales(curvature: np.ndarray) -> np.ndarray:
 
 
 def expanded(free: np.ndarray, width: np.ndarray, target: LogPosterior) -> tuple[float, np.ndarray, np.ndarray]:
-    """Minus the log density, its gradient and its curvature, from central differences over these widths.
-
-    A program of gradients would take as long to compile as everything else of a fit.
-    """
+    """Minus the log density, its gradient and its curvature, from central differences over these widths: a program of
+    gradients would take as long to compile as everything else of a fit."""
     d, steps = len(free), np.diag(width)
     i, j = np.triu_indices(d, 1)
     pairs = steps[i] + steps[j]

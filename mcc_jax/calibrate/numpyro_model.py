@@ -23,11 +23,11 @@ from .._types import Scalar
 from ..effects import Variant, find_variant
 from ..law import StrainScaling, Unloading
 from .data import Tests
-from .forward import Forms, Linear, Point, linearise
+from .forward import Forms, Point, linearise
 from .marginal import Marginal
 from .noise import FREEDOM, Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
-from .priors import Amplitude, NakagamiPrior, Priors, SpreadCoordinate, bounds_of_a, nuisance_prior
+from .priors import NOISE_PARAMETERS, Amplitude, NakagamiPrior, Priors, SpreadCoordinate, bounds_of_a, nuisance_prior
 
 sample: Any = numpyro.sample
 deterministic: Any = numpyro.deterministic
@@ -35,21 +35,17 @@ deterministic: Any = numpyro.deterministic
 
 @dataclass(frozen=True)
 class Model:
-    """What is assumed about a campaign; called with tests, it is a NumPyro model.
+    """What is assumed about a campaign; called with tests, it is a NumPyro model. Forms may be given as their text.
 
     Attributes:
         unloading: form of unloading, to which the modulus belongs.
         strain_scaling: how the shape factor enters unloading.
-        modulus_scatter: let the modulus differ from particle to particle.
-        shape_scatter: let `a` differ from particle to particle.
+        modulus_scatter, shape_scatter: let the modulus, or `a`, differ from particle to particle.
         priors: what is believed beforehand; the defaults of the form of unloading if None.
         effects: formulas that act on the law, one a mechanism; see `with_effects`.
         varying: mechanisms whose amplitude differs from particle to particle.
-        correlation: how rough correlated residuals are.
-        along: what they are correlated along, the path of force or time.
+        correlation, along: how rough correlated residuals are, along the path of force or in time.
         robust: white noise is Student's with 4 degrees of freedom, so that spikes count for little.
-
-    Forms may be given as their text.
     """
 
     unloading: Unloading
@@ -86,36 +82,36 @@ class Model:
         differ = tuple(dict.fromkeys([*_several(varying), *(v.mechanism for v in chosen if v.random_per_test)]))
         for name in differ:
             arguments.choice(name, names, "effect to vary")
-        fields = {
-            "unloading": arguments.member(unloading, Unloading, "unloading"),
-            "strain_scaling": arguments.member(strain_scaling, StrainScaling, "strain_scaling"),
-            "modulus_scatter": arguments.flag(modulus_scatter, "modulus_scatter"),
-            "shape_scatter": arguments.flag(shape_scatter, "shape_scatter"),
-            "priors": priors,
-            "effects": chosen,
-            "varying": differ,
-            "correlation": arguments.member(correlation, Correlation, "correlation"),
-            "along": arguments.member(along, Along, "along"),
-            "robust": arguments.flag(robust, "robust"),
-        }
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(
+            unloading=arguments.member(unloading, Unloading, "unloading"),
+            strain_scaling=arguments.member(strain_scaling, StrainScaling, "strain_scaling"),
+            modulus_scatter=arguments.flag(modulus_scatter, "modulus_scatter"),
+            shape_scatter=arguments.flag(shape_scatter, "shape_scatter"),
+            priors=priors,
+            effects=chosen,
+            varying=differ,
+            correlation=arguments.member(correlation, Correlation, "correlation"),
+            along=arguments.member(along, Along, "along"),
+            robust=arguments.flag(robust, "robust"),
+        )
 
     # ---- the model ---------------------------------------------------------------------------------------------------
 
     def __call__(self, tests: Tests | None, marginal: Marginal | None = None) -> None:
         """Displacement under measured force, of particles of one material.
 
-        Args:
-            tests: the measurements; `tests.unobserved()` to predict them.
-            marginal: of a fit: particles are integrated out, and the tests themselves are not looked at.
+        Of `tests.unobserved()` it is predicted. With the `marginal` of a fit, particles are integrated out, and the
+        tests themselves are not looked at.
         """
         if marginal is not None:
             numpyro.factor("tests", jnp.sum(marginal.log_likelihood(self.population(marginal))))
             return
         assert tests is not None
         p, count = self.chosen_priors, len(tests)
-        population, noise = self.population(tests, noise_factor=False), self._noise(count)
+        population = self.population(tests, noise_factor=False)
+        four = ((name, getattr(p, name)) for name in NOISE_PARAMETERS)
+        values = [sample(name, dist.LogNormal(np.log(x.median), x.log_sd)) for name, x in four]
+        noise = Noise(*values, scale=jnp.ones(count))
         with numpyro.plate("particle", count):
             xi = sample("deviation", dist.Normal().expand([self.scatter.size]).to_event(1))  # not centred: tau may be 0
             zero = sample("zero_um", dist.Normal(tests.contact + p.zero_um.mean, p.zero_um.sd))
@@ -127,17 +123,16 @@ class Model:
                 # Normal noise whose precision is gamma distributed from reading to reading is Student's.
                 gamma = dist.Gamma(FREEDOM / 2, FREEDOM / 2).expand([tests.force.shape[1]]).to_event(1)
                 tests = dataclasses.replace(tests, reading_weight=sample("reading_weight", gamma))
-            filters = self._filters(noise, Point(own.latent, zero, own.theta), tests)
+            # How noise of force moves the prediction is taken as known.
+            at = jax.lax.stop_gradient(Point(own.latent, zero, own.theta))
+            linear, kind = linearise(at, tests, self.forms, with_numbers=False), (self.correlation, self.along)
+            whiten = jax.vmap(lambda scale, one, linear: whitening(noise, scale, one, linear, *kind))
+            filters = whiten(noise.scale, tests, linear)
             observed = RecordNoise(clean + zero[:, None], filters, jnp.exp(population.log_noise))
             sample("displacement_um", observed, obs=tests.displacement)
 
     def population(self, shapes: Any, *, noise_factor: bool = True) -> Population:
-        """Priors of what all particles share, as NumPyro sites.
-
-        Args:
-            shapes: what has the `flatness` of the particles (`Tests` or `Marginal`).
-            noise_factor: whether a common factor on the noise is sampled.
-        """
+        """Priors of what all particles share, as NumPyro sites, for the `flatness` of `Tests` or of a `Marginal`."""
         p = self.chosen_priors
         weight = getattr(shapes, "weight", None)
         weight = jnp.ones_like(shapes.flatness) if weight is None else weight
@@ -145,7 +140,7 @@ class Model:
         reach = max(8 * p.a.sd, 8.0)  # the bounds scale a coordinate; they are no belief
         low, high = jnp.maximum(low, p.a.mean - reach), jnp.minimum(high, p.a.mean + reach)
         a = sample("a", dist.TruncatedNormal(p.a.mean, p.a.sd, low=low, high=high))
-        modulus = p.effective_modulus_MPa
+        modulus, factor = p.effective_modulus_MPa, p.noise_factor
         log_modulus = sample("log_modulus", dist.Normal(np.log(modulus.median), modulus.log_sd))
         deterministic("effective_modulus_MPa", jnp.exp(log_modulus))
         # Means at the campaign's average shape, so that they hardly depend on a.
@@ -165,7 +160,6 @@ class Model:
         theta, theta_scatter = self._effects()
         log_noise = zero
         if noise_factor:
-            factor = p.noise_factor
             log_noise = sample("log_noise_factor", dist.Normal(np.log(factor.median), factor.log_sd))
             deterministic("noise_factor", jnp.exp(log_noise))
         return Population(a, log_modulus, mu, tau, modulus_scatter, shape_scatter, log_noise, theta, theta_scatter)
@@ -182,23 +176,6 @@ class Model:
         none = jnp.zeros(0)
         theta = jnp.concatenate([none, *(jnp.reshape(x, 1) for x in (*amplitudes, *further))])
         return theta, jnp.concatenate([none, *(jnp.reshape(x, 1) for x in spreads)])
-
-    def _noise(self, count: int) -> Noise:
-        """White noise in displacement and in force, correlated noise along the path; all particles alike."""
-        p = self.chosen_priors
-        names = ("noise_displacement_um", "noise_force_mN", "noise_correlated_um", "noise_length")
-        priors = ((name, getattr(p, name)) for name in names)
-        four = [sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors]
-        return Noise(four[0], four[1], four[2], four[3], jnp.ones(count))
-
-    def _filters(self, noise: Noise, point: Point, tests: Tests) -> Whitening:
-        """The noise as displacement: how noise of force moves the prediction is taken as known."""
-        linear = linearise(jax.lax.stop_gradient(point), tests, self.forms, with_numbers=False)
-
-        def one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:
-            return whitening(noise, scale, tests, linear, self.correlation, self.along)
-
-        return jax.vmap(one)(noise.scale, tests, linear)
 
     # ---- what follows from it ----------------------------------------------------------------------------------------
 
@@ -236,8 +213,8 @@ class Model:
         return {v.mechanism: k for k, v in enumerate(self.effects) if v.mechanism in self.varying}
 
     def spread_prior(self, variant: Variant) -> NakagamiPrior:
-        """Prior of how much an amplitude differs between particles, open in its order of magnitude: in the logarithm,
-        or in its unit where it may have either sign."""
+        """Prior of how much an amplitude, or its logarithm, differs between particles; open in its order of
+        magnitude."""
         return NakagamiPrior(variant.plausible[1] if self._signed(variant) else 0.5, shape=0.25)
 
     @staticmethod
@@ -260,8 +237,7 @@ class Model:
         Raises:
             InputError: for an unknown name, with those that exist; for two formulas of one mechanism.
         """
-        new = tuple(_variant(one) for one in effects)
-        return dataclasses.replace(self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying)))
+        return dataclasses.replace(self, effects=(*self.effects, *effects), varying=(*self.varying, *_several(varying)))
 
 
 class RecordNoise(dist.Distribution):
@@ -283,11 +259,11 @@ class RecordNoise(dist.Distribution):
         """Draws; points that do not count are NaN."""
         count, points = self.loc.shape
 
+        colour = eqx.filter_vmap(lambda f, *normal: f.colour(*normal))
+
         def one(key: Any) -> Array:
             white, of_branches, of_zero = (jax.random.normal(k, (count, points)) for k in jax.random.split(key, 3))
-            drawn = eqx.filter_vmap(lambda f, *normal: f.colour(*normal))(
-                self.filters, white, of_branches, of_zero[:, 0]
-            )
+            drawn = colour(self.filters, white, of_branches, of_zero[:, 0])
             return jnp.where(self.filters.mask, self.loc + self.factor * drawn, jnp.nan)
 
         keys = jax.random.split(key, math.prod(sample_shape))

@@ -1,24 +1,16 @@
 """Every particle drawn back given draws of the population, with exact weights.
 
-1. Given the summaries (`marginal`), nothing but the population is left to sample.
-2. Given a draw of the population, every particle's parameters are nearly normal and independent: drawn directly.
-3. A summary is a quadratic; the true likelihood of a test is not. Their ratio at the drawn parameters is the draw's
-   importance weight, which makes the result exact whatever the summary's quality, and shows that quality (Pareto k).
-   Particles whose ratio scatters (a curve that snaps through, say) get several candidates per draw of the population,
-   of which one is kept in proportion to its ratio, and the mean ratio becomes the weight: the same exact posterior,
-   with less scatter.
-
-The exact weight of a draw of the population is the product of all particles' ratios of exact to quadratic likelihood.
-Of many particles the product scatters far more than it says: nearly all of its scatter is that of the particles' own
-draws. With the same random numbers for every draw of the population that scatter cancels, and the sum of log ratios is
-smooth in the population's parameters, linear over the little that the posterior leaves open: some tens of draws show
-it (`correction`).
+Given a draw of the population every particle's parameters are nearly normal and independent. The ratio of the exact
+likelihood to its quadratic summary (`marginal`) at the drawn parameters is the draw's importance weight. Where it
+scatters, one of several candidates is kept in proportion to its ratio, and the mean ratio becomes the weight. Of many
+particles the product of all ratios scatters too much; with common random numbers the sum of their logarithms is smooth,
+linear over the little that the posterior leaves open, and found by regression (`correction`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -62,8 +54,7 @@ SIDE_BY_SIDE = 2  # pieces that draws are cut into on a CPU, on any number of co
 
 
 class ParticleDraws(NamedTuple):
-    """Draws of the particles' parameters, one for each draw of the population, and the log of exact over quadratic
-    likelihood; 0 where the exact one was not looked at."""
+    """Particles' parameters for each draw of the population, and the log of exact over quadratic likelihood or 0."""
 
     latent: Float[Array, "draws particles 4"]
     theta: Float[Array, "draws particles numbers"]
@@ -73,8 +64,7 @@ class ParticleDraws(NamedTuple):
 
 
 class ExactLikelihood(eqx.Module):
-    """Tests with their noise, the summaries that particles are drawn by, and mean and standard deviation of the zeros'
-    prior [um]."""
+    """Tests with their noise, their summaries, and mean and standard deviation of the zeros' prior [um]."""
 
     tests: Tests
     filters: Whitening
@@ -105,13 +95,9 @@ def draw_particles(
 ) -> ParticleDraws:
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
-    Args:
-        keys: data of one random key, for every particle.
-        candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
-        common: use the same random numbers for every draw of the population.
-
-    Returns:
-        Arrays with the particles first, then the draws.
+    One is chosen of so many `candidates`; with 0 of them one is drawn and not compared. `keys` are the data of one
+    random key, for every particle; `common` random numbers are the same for every draw of the population. Results have
+    the particles first, then the draws.
     """
     draws, count, size = population.a.shape[0], len(exact.tests), exact.marginal.scatter.size
 
@@ -244,8 +230,8 @@ class Drawer:
 
 
 class Drawn(NamedTuple):
-    """Particles under every `keep`-th of the draws of the population that were chosen by weight, Pareto k of theirs and
-    of the population's weights, log of the mean ratio of exact to quadratic likelihood and its standard error."""
+    """Particles under every `keep`-th of the chosen draws of the population, Pareto k of theirs and of the population's
+    weights, log of the mean ratio of exact to quadratic likelihood and its standard error."""
 
     chosen: np.ndarray
     particles: ParticleDraws
@@ -257,9 +243,10 @@ class Drawn(NamedTuple):
 
 
 def weighted(
-    exact: ExactLikelihood, block: int, population: Population, length: Length, check_key: Array, pick_key: Array
+    exact: ExactLikelihood, block: int, population: Population, length: Length, keys: Sequence[Array]
 ) -> Drawn:
     """Few particles: the weight of a draw is the product of all particles' ratios of exact to quadratic likelihood."""
+    _, check_key, pick_key = keys
     drawer = Drawer(exact, block, -(-length.total // SIDE_BY_SIDE) if jax.default_backend() == "cpu" else None)
     particles = drawer.all(check_key, population)
     ratio = np.asarray(particles.log_ratio)
@@ -272,20 +259,11 @@ def weighted(
 
 
 def corrected(
-    exact: ExactLikelihood,
-    block: int,
-    population: Population,
-    parameters: np.ndarray,
-    length: Length,
-    check_key: Array,
-    pick_key: Array,
-    particle_key: Array,
+    exact: ExactLikelihood, block: int, population: Population, length: Length, keys: Sequence[Array], parameters: Any
 ) -> Drawn:
-    """Many particles: the draws of the population are weighted by regression (`correction`).
-
-    Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
-    several candidates; of the others the draws are left as they are.
-    """
+    """Many particles: the draws of the population are weighted by regression (`correction`), and only particles whose
+    weights scatter are drawn from several candidates."""
+    particle_key, check_key, pick_key = keys
     drawer = Drawer(exact, block, PROBES)
     checks = PROBES * max(2, COMPARED // (PROBES * drawer.count))
     ratio = np.asarray(drawer.all(check_key, some_of(population, evenly(length.total, checks))).log_ratio)
@@ -345,11 +323,11 @@ def evenly(count: int, some: int) -> np.ndarray:
 
 def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> tuple[np.ndarray, float]:
     """What the exact likelihood adds to the log density of the population at every draw, up to a constant, by
-    regression on the population's parameters; and the standard error of its slope, by how many standard deviations of
-    the posterior means would move.
+    regression on the population's parameters; and the standard error of its slope in standard deviations of the
+    posterior.
 
-    `total` gives the sums of log ratios at rows of `draws`, with random numbers that depend on its first argument, 0 or
-    1; `draws` are those of the parameters, shape (draws, parameters).
+    `total` gives the sums of log ratios at rows of `draws`, shape (draws, parameters), with one of two sets of random
+    numbers.
     """
     rows = evenly(len(draws), PROBES)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)

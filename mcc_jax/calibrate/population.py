@@ -17,41 +17,27 @@ COEFFICIENTS = ("C1", "C3", "C5")
 
 
 class Population(eqx.Module):
-    """What all particles share.
+    """What all particles share."""
 
-    Attributes:
-        a: shape parameter [-].
-        log_modulus: logarithm of the effective modulus in MPa.
-        mu, tau: means and standard deviations of log C1, log C3, log C5 over the particles.
-        modulus_scatter, shape_scatter: standard deviations of the log modulus and of `a`, to first order.
-        log_noise: logarithm of a factor on all noise.
-        theta: parameters of the effects: amplitudes, then further ones.
-        theta_scatter: standard deviation of the logarithm of each amplitude that differs from particle to particle, or
-            of the amplitude itself where both signs are physical.
-    """
-
-    a: Scalar
-    log_modulus: Scalar
-    mu: Float[Array, " 3"]
-    tau: Float[Array, " 3"]
-    modulus_scatter: Scalar
-    shape_scatter: Scalar
-    log_noise: Scalar
-    theta: Float[Array, " numbers"]
-    theta_scatter: Float[Array, " varying"]
+    a: Scalar  # shape parameter [-]
+    log_modulus: Scalar  # logarithm of the effective modulus in MPa
+    mu: Float[Array, " 3"]  # means of log C1, log C3, log C5 over the particles
+    tau: Float[Array, " 3"]  # and standard deviations
+    modulus_scatter: Scalar  # standard deviation of the log modulus
+    shape_scatter: Scalar  # and of `a`, to first order
+    log_noise: Scalar  # logarithm of a factor on all noise
+    theta: Float[Array, " numbers"]  # parameters of the effects: amplitudes, then further ones
+    theta_scatter: Float[Array, " varying"]  # sd of each amplitude that varies, of its log if it has one sign
 
 
 class Scatter(eqx.Module):
-    """How particles differ, and with how many Newton steps they are integrated out.
-
-    `power` is that with which the shape factor enters unloading. `varying` has the place of each amplitude that differs
-    and whether both signs are physical, `positive` the place of each effect parameter that must be positive and that
-    of its amplitude.
-    """
+    """How particles differ, and with how many Newton steps they are integrated out."""
 
     modulus: bool = eqx.field(static=True, default=False)
     shape: bool = eqx.field(static=True, default=False)
-    power: float = eqx.field(static=True, default=0.0)
+    power: float = eqx.field(static=True, default=0.0)  # with which the shape factor enters unloading
+    # Places of amplitudes that differ, and whether both signs are physical; places of positive numbers of effects, and
+    # of their amplitudes.
     varying: tuple[tuple[int, bool], ...] = eqx.field(static=True, default=())
     positive: Places = eqx.field(static=True, default=())
     newton: int = eqx.field(static=True, default=4)
@@ -86,15 +72,12 @@ def moments(
 
 
 class Particles(eqx.Module):
-    """Particles at their deviations from the population: b1, b3, b5, e and the parameters of their effects.
+    """Particles at their deviations from the population."""
 
-    `factor` and `slope` are the derivatives of the former and of the amplitudes that vary by the deviations.
-    """
-
-    latent: Float[Array, "particles 4"]
-    theta: Float[Array, "particles numbers"]
-    factor: Float[Array, "particles 4 k"]
-    slope: Float[Array, "particles varying"]
+    latent: Float[Array, "particles 4"]  # b1, b3, b5, e
+    theta: Float[Array, "particles numbers"]  # parameters of their effects
+    factor: Float[Array, "particles 4 k"]  # derivatives of `latent` by the deviations
+    slope: Float[Array, "particles varying"]  # and of the amplitudes that vary
 
 
 def particles_at(

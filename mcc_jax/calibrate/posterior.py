@@ -43,22 +43,16 @@ class Posterior(PosteriorDraws):
 
     Attributes:
         population: draws of the population.
-        C: draws of every particle's C1, C3, C5, shape (chains, draws, N, 3).
-        modulus_MPa: of its effective modulus.
-        zero_um: of its displacement offset.
-        shape_factor: of its eta_p.
+        C, modulus_MPa, zero_um, shape_factor: of every particle's C1, C3, C5, shape (chains, draws, N, 3), of its
+            effective modulus, displacement offset and eta_p.
         theta: of the parameters of its effects, in the order of `model.forms.names`.
         log_likelihood: of its whole test under each draw of the population, the particle integrated out: what
             leave-one-particle-out needs.
-        pareto_k: of every particle's importance weights.
+        pareto_k, pareto_k_joint: of every particle's importance weights, and of those of all together or None.
         mode: "fast" or "joint".
-        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
-            has them; None where they were not formed.
-        weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
-            population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
-        divergences: number of divergent trajectories.
+        weights_applied: whether the draws were resampled by the particles' own weights.
+        divergences, leapfrogs: of NUTS, divergent trajectories and mean steps of a draw; 0 of independent draws.
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
         log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
             approximation alone).
     """
@@ -143,7 +137,7 @@ class Posterior(PosteriorDraws):
         mu, tau = np.asarray(self.population.mu), np.asarray(self.population.tau)
         return np.exp(mu[..., 0] + tau[..., 0] ** 2 / 2) / 17.16
 
-    def to_arviz(self, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
+    def to_arviz(self, *, seed: int = 0) -> DataTree:
         """The posterior as an ArviZ `DataTree`; its `to_netcdf(file)` writes it.
 
         Groups: `posterior` (population, effects and every particle), `log_likelihood`, `log_prior` (by site), `prior`,
@@ -151,16 +145,9 @@ class Posterior(PosteriorDraws):
         `observed_data`, `constant_data`. Every variable has its unit in its attributes.
 
         `log_likelihood` has the variable `test`: each particle's whole test given the population, the particle
-        integrated out, so that ArviZ's `loo` leaves one *particle* out. With `points` it has `displacement_um` instead,
-        the density of every reading given those before it and its particle's random effects, along the dimension
-        `observation`, which observed data and predictions then share; draws are thinned.
-
-        Args:
-            prior_count: draws from the prior.
-            points: likelihoods by reading.
-            seed: random seed of prior and predictive draws.
+        integrated out, so that ArviZ's `loo` leaves one *particle* out. `seed` is that of prior and predictive draws.
         """
-        return data_tree(self, prior_count, points, seed)
+        return data_tree(self, seed)
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a, the modulus and the population, as in `calibration.json`."""
@@ -201,21 +188,27 @@ class Posterior(PosteriorDraws):
             "noise": self._noise_numbers() | {"factor": summary(named["noise_factor"])},
             "priors": self.model.chosen_priors.to_json(),
             "particles": self._entries_of_tests(numbers, pareto_k=self.pareto_k),
-            "diagnostics": {
-                "rhat_max": finite(max(self.rhat.values())),
-                "ess_bulk_min": finite(min(self.ess_bulk.values())),
+            "diagnostics": self.diagnostics()
+            | {
                 "ess_tail_min": finite(min(self.ess_tail.values())),
-                "divergences": self.divergences,
-                "pareto_k_max": finite(float(np.max(self.pareto_k))),
-                "pareto_k_joint": finite(self.pareto_k_joint),
                 "weights_applied": self.weights_applied,
                 "leapfrogs_mean": finite(self.leapfrogs),
                 "log_evidence": finite(self.log_evidence[0]),
                 "log_evidence_error": finite(self.log_evidence[1]),
                 "noise_share": finite(self.noise_share),
                 "own_misfit": finite(self.own_misfit),
-                "failures": self.failures(),
             },
+        }
+
+    def diagnostics(self) -> dict[str, Any]:
+        """What `failures` goes by, as in `calibration.json`."""
+        return {
+            "rhat_max": finite(max(self.rhat.values())),
+            "ess_bulk_min": finite(min(self.ess_bulk.values())),
+            "divergences": self.divergences,
+            "pareto_k_max": finite(float(np.max(self.pareto_k))),
+            "pareto_k_joint": finite(self.pareto_k_joint),
+            "failures": self.failures(),
         }
 
 
@@ -236,13 +229,11 @@ def sample(
 ) -> Posterior:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
 
-    The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough: see
-    `importance`. Of many particles (more than 400,000 draws of single ones) the exact likelihood enters by
-    regression, and at most four million draws of single particles are stored: see `particles`.
-
-    Blocks of particles are distributed over all devices of the process and, once `jax.distributed.initialize` has been
-    called, over all processes: each of them then calls this function with the same arguments, and gets the result of
-    one process. Over several devices of one process the fits agree to about 1e-9, and the draws are others.
+    The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough. Of
+    many particles (more than 400,000 draws of single ones) the exact likelihood enters by regression, and at most four
+    million draws of single particles are stored. Particles are distributed over all devices of the process and, once
+    `jax.distributed.initialize` has been called, over all processes, each of which then calls this function with the
+    same arguments and gets the result of one process.
 
     Args:
         campaign: the tests.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -19,10 +19,9 @@ from ..effects import Record
 from ..geometry import Particle
 from ..law import MccLaw, Plastic
 from .compiling import compiled
-from .data import Tests
-from .draws import named_population
+from .draws import coordinates_of, named_population
 from .estimates import summary
-from .noise import Whitening, forward_substitution
+from .noise import Whitening
 from .numpyro_model import Model
 from .population import COEFFICIENTS, Population, flattened
 from .priors import population_sites
@@ -53,7 +52,7 @@ VARIABLES: dict[str, tuple[str, list[str]]] = {
 
 CURVES = 50  # per chain and particle that are predicted
 POINTS = 2_000_000  # most points of all curves together: of large campaigns the first particles only
-POINTS_DRAWS = 250  # per chain that are kept where every point has a likelihood of its own
+PRIOR_DRAWS = 500
 
 
 @dataclass(frozen=True)
@@ -174,11 +173,8 @@ def predict_new_particle(
 
 
 def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
-    """Draws of a measured particle's curve at its measured forces, its zero included, without and with noise.
-
-    Raises:
-        InputError: if the particle did not take part.
-    """
+    """Draws of a measured particle's curve at its measured forces, its zero included, without and with noise. Raises
+    `InputError` if the particle did not take part."""
     count = arguments.whole(count, "count", least=1)
     seed = arguments.seed(seed)
     if particle not in calibration.particles:
@@ -235,17 +231,12 @@ def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
     return {"mu": mu, "tau": np.asarray(p.tau)} | medians | named
 
 
-def data_tree(c: Any, prior_count: int, points: bool, seed: int) -> DataTree:
+def data_tree(c: Any, seed: int) -> DataTree:
     """What `Posterior.to_arviz` gives."""
     from arviz_base import from_dict
 
-    prior = prior_draws(c, arguments.whole(prior_count, "prior_count", least=1), arguments.seed(seed))
-    if points:
-        every = -(-c.C.shape[1] // POINTS_DRAWS)
-        names = ("population", "C", "modulus_MPa", "zero_um", "shape_factor", "theta", "log_likelihood")
-        thinned = {name: jax.tree.map(lambda x: np.asarray(x)[:, ::every], getattr(c, name)) for name in names}
-        c = replace(c, **thinned)
-    tests, particles, mask = c.selection.tests, list(c.particles), np.asarray(c.selection.tests.mask)
+    prior = prior_draws(c, PRIOR_DRAWS, arguments.seed(seed))
+    tests, mask, varying = c.selection.tests, np.asarray(c.selection.tests.mask), c.model.varying_places
     posterior: dict[str, Any] = _variables(c.population, c.model) | {
         "yield_stress_MPa": c.yield_stress_MPa(),
         "C": c.C,
@@ -254,26 +245,9 @@ def data_tree(c: Any, prior_count: int, points: bool, seed: int) -> DataTree:
     }
     if c.model.modulus_scatter:
         posterior["particle_modulus_MPa"] = c.modulus_MPa
-    posterior |= {f"particle_{name}": c.theta[..., k] for name, k in c.model.varying_places.items()}
-    sites = population_sites(c.model, np.asarray(c.fit.tests.flatness), flattened(c.population))
-    prior_density = {name: values.reshape(len(c.C), -1) for name, values in sites.log_densities().items()}
-    shown, predicted, before = _predictive(c, prior, seed, everything=points)
-    observed = np.where(mask, np.asarray(tests.displacement), np.nan)
-    likelihood: dict[str, Any] = {"test": c.log_likelihood}
-    dims = {name: dimensions for name, (_, dimensions) in VARIABLES.items() if dimensions}
-    dims |= {f"particle_{name}": ["particle"] for name in c.model.varying_places}
-    coords: dict[str, Any] = {
-        "particle": particles,
-        "coefficient": list(COEFFICIENTS),
-        "point": np.arange(mask.shape[1]),
-        "axis": ["D1", "D2", "D3"],
-    }
-    some = coords | {"particle": particles[:shown]}
-    if points:
-        likelihood = {"displacement_um": _point_likelihoods(c)[..., mask]}
-        observed, dims["displacement_um"] = observed[mask], ["observation"]
-        coords["observation"], some["observation"] = np.arange(mask.sum()), np.arange(mask[:shown].sum())
-        predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
+    posterior |= {f"particle_{name}": c.theta[..., k] for name, k in varying.items()}
+    known = coordinates_of(flattened(c.population), c.model)
+    sites = population_sites(c.model, np.asarray(c.fit.tests.flatness), known)
     constant = {
         "force_mN": np.asarray(tests.force),
         "diameters_um": c.campaign.diameters_um[list(c.selection.kept)],
@@ -283,17 +257,21 @@ def data_tree(c: Any, prior_count: int, points: bool, seed: int) -> DataTree:
     }
     groups = {
         "posterior": posterior,
-        "log_likelihood": likelihood,
-        "log_prior": prior_density,
+        "log_likelihood": {"test": c.log_likelihood},
+        "log_prior": {name: values.reshape(len(c.C), -1) for name, values in sites.log_densities().items()},
         "sample_stats": {"lp_test": c.log_likelihood.sum(-1)},
         "prior": prior,
-        "observed_data": {"displacement_um": observed},
+        "observed_data": {"displacement_um": np.where(mask, np.asarray(tests.displacement), np.nan)},
         "constant_data": constant,
     }
-    tree = from_dict(groups, coords=coords, dims=dims)
+    dims = {name: dimensions for name, (_, dimensions) in VARIABLES.items() if dimensions}
+    dims |= {f"particle_{name}": ["particle"] for name in varying}
+    coords: dict[str, Any] = {"particle": list(c.particles), "point": np.arange(mask.shape[1])}
+    tree = from_dict(groups, coords=coords | {"coefficient": list(COEFFICIENTS), "axis": ["D1", "D2", "D3"]}, dims=dims)
+    predicted, before = _predictive(c, prior, seed)
     curves = from_dict(
         {"posterior_predictive": {"displacement_um": predicted}, "prior_predictive": {"displacement_um": before}},
-        coords={name: some[name] for name in dims["displacement_um"]},
+        coords=coords | {"particle": list(c.particles[: predicted.shape[2]])},
         dims={"displacement_um": dims["displacement_um"]},
     )
     for group in ("posterior_predictive", "prior_predictive"):
@@ -303,74 +281,30 @@ def data_tree(c: Any, prior_count: int, points: bool, seed: int) -> DataTree:
     for group in tree.children.values():
         for name, variable in group.data_vars.items():
             variable.attrs["units"] = units.get(str(name), "nat" if group.name == "log_prior" else "1")
-    tree.attrs.update(
-        {
-            "method": "bayes",
-            "mode": c.mode,
-            "seed": c.seed,
-            "unloading": c.model.unloading.value,
-            "strain_scaling": c.model.strain_scaling.value,
-            "effects": ", ".join(c.model.variants),
-            "converged": str(c.converged),
-            "divergences": c.divergences,
-        }
-    )
+    form = {"unloading": c.model.unloading.value, "strain_scaling": c.model.strain_scaling.value}
+    made = {"method": "bayes", "mode": c.mode, "seed": c.seed, "converged": str(c.converged)}
+    tree.attrs.update(made | form | {"effects": ", ".join(c.model.variants), "divergences": c.divergences})
     # The time of day would make two runs of one seed differ.
     for group in tree.subtree:
         group.attrs.pop("created_at", None)
     return tree
 
 
-def _predictive(
-    c: PosteriorDraws, prior: dict[str, np.ndarray], seed: int, *, everything: bool
-) -> tuple[int, np.ndarray, np.ndarray]:
-    """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked.
-
-    Of the posterior either draws and particles enough for a picture, or everything.
-    """
+def _predictive(c: PosteriorDraws, prior: dict[str, np.ndarray], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draws of the first particles' displacements by posterior and prior, enough for a picture; NaN where masked."""
     mask = np.asarray(c.selection.tests.mask)
     chains, draws = c.C.shape[:2]
-    shown, points = mask.shape
-    pick = np.arange(chains * draws).reshape(chains, draws)
-    if not everything:
-        shown = max(1, min(shown, POINTS // (chains * CURVES * points)))
-        pick = pick[:, :: -(-draws // CURVES)]
-    predicted = np.full((*pick.shape, shown, points), np.nan, np.float32)
-    before = np.full((1, CURVES, shown, points), np.nan, np.float32)
+    shown = max(1, min(len(mask), POINTS // (chains * CURVES * mask.shape[1])))
+    pick = np.arange(chains * draws).reshape(chains, draws)[:, :: -(-draws // CURVES)]
+    predicted = np.full((*pick.shape, shown, mask.shape[1]), np.nan, np.float32)
+    before = np.full((1, CURVES, shown, mask.shape[1]), np.nan, np.float32)
     for row in range(shown):
         curves = predicted_at(c, row, pick.ravel(), seed + row).observed_um
         assert curves is not None
         length = curves.shape[1]
         predicted[:, :, row, :length] = np.where(mask[row, :length], curves.reshape(*pick.shape, length), np.nan)
         before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, CURVES, seed), np.nan)
-    return shown, predicted, before
-
-
-def _point_likelihoods(c: PosteriorDraws) -> np.ndarray:
-    """Log density of every reading given those before it and its particle's own numbers, shape (chain, draw, N, n)."""
-    a, log_noise = (flattened(np.asarray(x)) for x in (c.population.a, c.population.log_noise))
-    found = []
-    for row in range(len(c.particles)):
-        C, modulus, theta, zero = flattened(tuple(x[:, :, row] for x in (c.C, c.modulus_MPa, c.theta, c.zero_um)))
-        laws = laws_with(c.model, C, a, modulus, theta)
-        test, noise = jax.tree.map(lambda x, r=row: x[r], (c.fit.tests, c.fit.filters))
-        found.append(np.asarray(_one_ahead(laws, jnp.asarray(zero), jnp.asarray(np.exp(log_noise)), test, noise)))
-    return np.stack(found, 1).reshape(*c.C.shape[:3], -1)
-
-
-@compiled
-def _one_ahead(laws: MccLaw, zero: Array, factor: Array, test: Tests, noise: Whitening) -> Array:
-    assert test.displacement is not None
-    measured = test.displacement
-
-    def one(given: Any) -> Array:
-        law, z, f = given
-        away = jnp.where(test.mask, measured - law.respond(test.particle, test.record) - z, 0.0)
-        innovation = forward_substitution(noise.solver, away[:, None])[:, 0]
-        sd = noise.solver.factor.diag.d * f
-        return -0.5 * (innovation / f) ** 2 - jnp.log(sd) - 0.5 * jnp.log(2 * jnp.pi)
-
-    return jax.lax.map(one, (laws, zero, factor))
+    return predicted, before
 
 
 def _prior_curves(c: PosteriorDraws, prior: dict[str, np.ndarray], row: int, count: int, seed: int) -> np.ndarray:

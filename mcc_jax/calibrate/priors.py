@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -31,6 +32,7 @@ ALMOST = 0.98  # share of the way to the value of a at which a particle's shape 
 CELLULOSE = 11.0, 0.6
 KNEE = 0.1  # share of its prior's scale above which a spread's coordinate is logarithmic
 SCALES = 4  # an amplitude's prior is an equal mixture of so many scales, from barely credible to the largest that is
+NOISE_PARAMETERS = "noise_displacement_um", "noise_force_mN", "noise_correlated_um", "noise_length"
 
 
 @dataclass(frozen=True)
@@ -64,24 +66,18 @@ class NakagamiPrior:
     That is Nakagami's distribution (1960) with :math:`\Omega = 2 m s^2`; at m = 1/2 it is half-normal.
 
     Attributes:
-        sd: s, beyond which no spread is expected; at m = 1/2 the standard deviation of the normal distribution that is
-            cut off below 0.
-        shape: m, at most 1/2. At 1/2 all spreads much below s are equally likely, so that one below s/1000 is a thing
-            of one in a thousand. At 1/8 even the order of magnitude is open: half of all spreads lie below s/14, one
-            in five below s/560, one in ten below s/9000.
-
-    Raises:
-        InputError: if s is not positive, or m not between 0 and 1/2 (beyond, no spread could be 0).
+        sd: s, beyond which no spread is expected; at m = 1/2 that of the normal distribution that is cut off below 0.
+        shape: m, at most 1/2. At 1/2 all spreads much below s are equally likely. At 1/8 even the order of magnitude is
+            open: half of all spreads lie below s/14, one in five below s/560, one in ten below s/9000.
     """
 
     sd: float
     shape: float = 0.5
 
     def __post_init__(self) -> None:
+        shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=0.5)
         object.__setattr__(self, "sd", arguments.number(self.sd, "the scale sd of a spread", above=0))
-        object.__setattr__(
-            self, "shape", arguments.number(self.shape, "the shape of a spread's prior", above=0, most=0.5)
-        )
+        object.__setattr__(self, "shape", shape)
 
 
 class NoisePrior(NamedTuple):
@@ -111,10 +107,8 @@ class Priors:
             initial slope that is lost at the curve's bend. It replaces C3, whose median follows. At 1 the curve is flat
             there, beyond 1 its stress falls; most powders stay well below, single particles need not.
         tau_C1, tau_C3, tau_C5: standard deviation of log C over the particles. That of C3 is open in its order of
-            magnitude: the paper's 20 particles show none at all (Table 2), and the smaller it is, the better a and the
-            means are known.
-        modulus_scatter: standard deviation of the logarithm of the modulus over the particles, if it may scatter.
-        shape_scatter: standard deviation of a over the particles, if it may scatter.
+            magnitude: the paper's 20 particles show none at all (Table 2).
+        modulus_scatter, shape_scatter: that of the logarithm of the modulus, and of a, if these may scatter.
         zero_um: how far the true zero of displacement may lie from the recorded contact [um].
         noise_displacement_um, noise_force_mN, noise_correlated_um, noise_length: see `Noise`.
         noise_factor: common factor on the noise as estimated beforehand.
@@ -154,31 +148,22 @@ class Priors:
         Under a change of units of stress and strain the coefficients go as :math:`C_1 \sim \sigma/\epsilon`,
         :math:`C_5 \sim \sigma^{1/5}/\epsilon` and the modulus as :math:`\sigma/\epsilon^3` (printed form) or
         :math:`\sigma/\epsilon^{3/2}` (punch forms), so medians move with stress and strain at the median test's peak;
-        widths are twice those for cellulose, since a shape of curve that is known for one material is a guess for
-        another. The length of correlated noise stays near its median: noise that is correlated over several branches
-        would describe any test.
+        widths are twice those for cellulose. The length of correlated noise stays near its median: noise that is
+        correlated over several branches would describe any test.
         """
         base = cls.default(unloading)
         up, along = stress_MPa / CELLULOSE[0], strain / CELLULOSE[1]
-        power = 3.0 if arguments.member(unloading, Unloading, "unloading").stress_power == 1 else 1.5
-
-        def moved(prior: LogNormalPrior, factor: float) -> LogNormalPrior:
-            return LogNormalPrior(prior.median * factor, 2 * prior.log_sd)
-
-        def wider(prior: NakagamiPrior) -> NakagamiPrior:
-            return NakagamiPrior(2 * prior.sd, prior.shape)
-
-        return dataclasses.replace(
-            base,
-            C1=moved(base.C1, up / along),
-            C5=moved(base.C5, up**0.2 / along),
-            softening=moved(base.softening, 1.0),
-            effective_modulus_MPa=moved(base.effective_modulus_MPa, up / along**power),
-            tau_C1=wider(base.tau_C1),
-            tau_C3=wider(base.tau_C3),
-            tau_C5=wider(base.tau_C5),
-            noise_length=LogNormalPrior(base.noise_length.median, 0.25),
-        )
+        form = arguments.member(unloading, Unloading, "unloading")
+        modulus = up / along ** (3.0 if form.stress_power == 1 else 1.5)
+        factors = {"C1": up / along, "C5": up**0.2 / along, "softening": 1.0, "effective_modulus_MPa": modulus}
+        changed: dict[str, Any] = {"noise_length": LogNormalPrior(base.noise_length.median, 0.25)}
+        for name, factor in factors.items():
+            prior = getattr(base, name)
+            changed[name] = LogNormalPrior(prior.median * factor, 2 * prior.log_sd)
+        for name in ("tau_C1", "tau_C3", "tau_C5"):
+            prior = getattr(base, name)
+            changed[name] = NakagamiPrior(2 * prior.sd, prior.shape)
+        return dataclasses.replace(base, **changed)
 
     @property
     def log_C3(self) -> float:
@@ -189,7 +174,7 @@ class Priors:
     @property
     def noise(self) -> NoisePrior:
         """The four priors of the noise together."""
-        four = (self.noise_displacement_um, self.noise_force_mN, self.noise_correlated_um, self.noise_length)
+        four = [getattr(self, name) for name in NOISE_PARAMETERS]
         return NoisePrior(np.array([p.median for p in four]), np.array([p.log_sd for p in four]))
 
     def to_json(self) -> dict[str, Any]:
@@ -269,19 +254,12 @@ class SpreadCoordinate(dist.Distribution):
     support: Any = constraints.real
 
     def __init__(self, prior: NakagamiPrior) -> None:
-        self.prior, self.power = prior, 1 / (2 * prior.shape)
+        m, s = prior.shape, prior.sd
+        self.prior, self.power = prior, 1 / (2 * m)
+        self.unit = KNEE * s  # the spread where sinh |x| is 1
+        # The log density at 0.
+        self.constant = -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(self.unit) + math.log(self.power)
         super().__init__(batch_shape=(), event_shape=())
-
-    @property
-    def unit(self) -> float:
-        """The spread where sinh |x| is 1."""
-        return KNEE * self.prior.sd
-
-    @property
-    def constant(self) -> float:
-        """The log density at 0."""
-        m, s = self.prior.shape, self.prior.sd
-        return -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(self.unit) + math.log(self.power)
 
     def spread(self, coordinate: Any) -> Any:
         """The spread at a coordinate."""
@@ -312,11 +290,9 @@ class SpreadCoordinate(dist.Distribution):
 
 
 class Amplitude(dist.Distribution):
-    """The amplitude of an effect in units of the smallest plausible one, along its physical sign.
-
-    An equal mixture of half-normal distributions, of normal ones where both signs are physical, whose scales are spread
-    evenly in the logarithm from the smallest to the largest plausible amplitude.
-    """
+    """The amplitude of an effect in units of the smallest plausible one, along its physical sign: an equal mixture of
+    normal distributions, cut off at 0 if of one sign, with scales even in the logarithm up to the largest plausible
+    one."""
 
     arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
 
@@ -324,12 +300,9 @@ class Amplitude(dist.Distribution):
         low, high = variant.plausible
         self.scales = np.geomspace(1.0, high / low, SCALES)
         self.both = variant.sign == 0
+        # Softplus keeps the coordinate linear where the amplitude is more than barely plausible.
+        self._support = constraints.real if self.both else constraints.softplus_positive
         super().__init__(batch_shape=(), event_shape=())
-
-    @property
-    def support(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Softplus keeps the coordinate linear where the amplitude is more than barely plausible."""
-        return constraints.real if self.both else constraints.softplus_positive
 
     def log_prob(self, value: Any, intermediates: Any = None) -> Any:
         """Log density."""
@@ -384,58 +357,50 @@ class Sites(NamedTuple):
 
 
 def population_sites(
-    model: Any, flatness: np.ndarray, known: Population | None, rng: np.random.Generator | None = None, count: int = 1
+    model: Any, flatness: np.ndarray, known: Mapping[str, np.ndarray] | None, rng: Any = None, count: int = 1
 ) -> Sites:
-    """The sites of a `Model` at known populations, every field with a leading axis, or else at draws from the prior.
-
-    Of the coordinates of a known spread it is the positive one.
-    """
+    """The sites of a `Model` at known numbers of the population, as `coordinates_of` has them, or at prior draws."""
     from scipy.stats import lognorm, norm, truncnorm  # slow to import, so only where it is used
 
     prior, priors, values = model.chosen_priors, {}, {}
+    at: Mapping[str, Any] = known or defaultdict(float)
 
-    def site(name: str, prior: Any, of: Callable[[Population], Any]) -> np.ndarray:
+    def site(name: str, prior: Any, value: Any) -> np.ndarray:
         priors[name] = prior
-        values[name] = prior.rvs(size=count, random_state=rng) if known is None else np.asarray(of(known))
+        values[name] = value if known else prior.rvs(size=count, random_state=rng)
         return values[name]
 
     def truncated(mean: float, sd: float, low: float, high: float) -> Any:
         return truncnorm((low - mean) / sd, (high - mean) / sd, mean, sd)
 
-    def spread(name: str, prior: Any, of: Callable[[Population], Any]) -> Any:
+    def spread(name: str, prior: Any) -> Any:
         one = SpreadCoordinate(prior)
-        return one.spread(site(f"{name}_coordinate", one, lambda p: one.coordinate(np.asarray(of(p)))))
+        return one.spread(site(f"{name}_coordinate", one, one.coordinate(at[name])))
 
-    a = site("a", truncated(prior.a.mean, prior.a.sd, *bounds_of_a(flatness)), lambda p: p.a)
+    a = site("a", truncated(prior.a.mean, prior.a.sd, *bounds_of_a(flatness)), at["a"])
     modulus, factor, softening = prior.effective_modulus_MPa, prior.noise_factor, prior.softening
-    log_modulus = site("log_modulus", norm(np.log(modulus.median), modulus.log_sd), lambda p: p.log_modulus)
+    log_modulus = site("log_modulus", norm(np.log(modulus.median), modulus.log_sd), at["log_modulus"])
     shift = np.log1p(a[:, None] * flatness).mean(-1)
-    b1 = site("b1", norm(np.log(prior.C1.median) + shift, prior.C1.log_sd), lambda p: p.mu[:, 0] + shift)
-    b5 = site("b5", norm(np.log(prior.C5.median) + shift, prior.C5.log_sd), lambda p: p.mu[:, 2] + shift)
+    b1 = site("b1", norm(np.log(prior.C1.median) + shift, prior.C1.log_sd), at["mu_C1"] + shift)
+    b5 = site("b5", norm(np.log(prior.C5.median) + shift, prior.C5.log_sd), at["mu_C5"] + shift)
     middle = (np.log(20 / 9 * softening.median) + b1 + 5 * b5) / 6
-    b3 = site("b3", norm(middle, softening.log_sd / 6), lambda p: p.mu[:, 1] + shift)
-    tau = [
-        spread(f"tau_{n}", getattr(prior, f"tau_{n}"), lambda p, j=j: p.tau[:, j]) for j, n in enumerate(COEFFICIENTS)
-    ]
+    b3 = site("b3", norm(middle, softening.log_sd / 6), at["mu_C3"] + shift)
+    tau = [spread(f"tau_{name}", getattr(prior, f"tau_{name}")) for name in COEFFICIENTS]
     scatters = [
-        spread(name, getattr(prior, name), lambda p, n=name: getattr(p, n))
-        if getattr(model, name)
-        else np.zeros_like(a)
+        spread(name, getattr(prior, name)) if getattr(model, name) else np.zeros_like(a)
         for name in ("modulus_scatter", "shape_scatter")
     ]
     theta, further, own = [], [], []
     for v in model.effects:
-        unit, k = (v.sign or 1) * v.plausible[0], len(theta)
-        theta.append(unit * site(f"{v.mechanism}_size", Amplitude(v), lambda p, k=k, unit=unit: p.theta[:, k] / unit))
+        unit = (v.sign or 1) * v.plausible[0]
+        theta.append(unit * site(f"{v.mechanism}_size", Amplitude(v), at[v.mechanism] / unit))
         for n in v.nuisances:
-            mean, sd = nuisance_moments(n)
+            name, (mean, sd) = f"{v.mechanism}.{n.name}", nuisance_moments(n)
             law = lognorm(sd, scale=np.exp(mean)) if n.plausible[0] > 0 else truncated(mean, sd, *n.plausible)
-            place = len(model.effects) + len(further)
-            further.append(site(f"{v.mechanism}.{n.name}", law, lambda p, k=place: p.theta[:, k]))
+            further.append(site(name, law, at[name]))
         if v.mechanism in model.varying:
-            j = len(own)
-            own.append(spread(f"tau_{v.mechanism}", model.spread_prior(v), lambda p, j=j: p.theta_scatter[:, j]))
-    log_noise = site("log_noise_factor", norm(np.log(factor.median), factor.log_sd), lambda p: p.log_noise)
+            own.append(spread(f"tau_{v.mechanism}", model.spread_prior(v)))
+    log_noise = site("log_noise_factor", norm(np.log(factor.median), factor.log_sd), at["noise_factor"])
     mu, tau = np.stack([b1, b3, b5], -1) - shift[:, None], np.stack(tau, -1)
     numbers, spreads = (np.reshape(x, (-1, len(a))).T for x in (theta + further, own))
     fields = (a, log_modulus, mu, tau, *scatters, log_noise, numbers, spreads)

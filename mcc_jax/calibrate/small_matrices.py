@@ -20,15 +20,13 @@ class Cholesky:
     """A = L L^T of positive definite matrices with a small, static size p; not a pytree, lives within one function."""
 
     def __init__(self, A: Matrix) -> None:
-        size = A.shape[-1]
         rows: list[list[Array]] = []
-        for i in range(size):
+        for i in range(A.shape[-1]):
             row: list[Array] = []
             for j in range(i):
-                row.append((A[..., i, j] - sum((row[k] * rows[j][k] for k in range(j)), jnp.zeros(()))) / rows[j][j])
-            left = A[..., i, i] - sum((row[k] * row[k] for k in range(i)), jnp.zeros(()))
-            rows.append([*row, jnp.sqrt(left)])
-        self.rows, self.size = rows, size
+                row.append((A[..., i, j] - _dot(row, rows[j])) / rows[j][j])
+            rows.append([*row, jnp.sqrt(A[..., i, i] - _dot(row, row))])
+        self.rows, self.size = rows, len(rows)
 
     def log_det(self) -> Float[Array, "*batch"]:
         """log det A."""
@@ -37,16 +35,16 @@ class Cholesky:
     def forward(self, b: Vector) -> Vector:
         """L^-1 b."""
         x: list[Array] = []
-        for i in range(self.size):
-            x.append((b[..., i] - sum((self.rows[i][k] * x[k] for k in range(i)), jnp.zeros(()))) / self.rows[i][i])
+        for i, row in enumerate(self.rows):
+            x.append((b[..., i] - _dot(x, row)) / row[i])
         return jnp.stack(x, -1)
 
     def backward(self, b: Vector) -> Vector:
         """L^-T b; of a standard normal vector, a draw with covariance A^-1."""
-        x: list[Array] = [b[..., 0]] * self.size
+        x: list[Array] = []
         for i in reversed(range(self.size)):
-            later = sum((self.rows[k][i] * x[k] for k in range(i + 1, self.size)), jnp.zeros(()))
-            x[i] = (b[..., i] - later) / self.rows[i][i]
+            column = [row[i] for row in self.rows[i + 1 :]]
+            x.insert(0, (b[..., i] - _dot(x, column)) / self.rows[i][i])
         return jnp.stack(x, -1)
 
     def solve(self, b: Vector) -> Vector:
@@ -60,6 +58,11 @@ class Cholesky:
         return jnp.stack(columns, -1)
 
 
+def _dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    """The sum of products, as far as the shorter one goes."""
+    return sum((a * b for a, b in zip(x, y, strict=False)), jnp.zeros(()))
+
+
 def eliminate(
     gram: Matrix, own: Sequence[int], precision: Float[Array, "*batch o"], mean: Float[Array, "*batch o"] | float = 0.0
 ) -> tuple[Float[Array, "*batch r r"], Float[Array, "*batch"]]:
@@ -70,14 +73,8 @@ def eliminate(
     .. math:: \int e^{-\frac12 \|y - X_o x_o - X_r x_r\|^2}\, N(x_o;\, m, P^{-1})\, dx_o
         = e^{L - \frac12 (x_r, -1)^T G' (x_r, -1)}
 
-    Args:
-        gram: Gram matrix, the data in its last column.
-        own: which columns are integrated out.
-        precision: P, of each of them.
-        mean: m.
-
-    Returns:
-        G', over the columns that are left, and L.
+    The data are the last column of `gram`; those of `own` are integrated out, under `precision` P and `mean` m of each.
+    Returned are G', over the columns that are left, and L.
     """
     inside = np.asarray(own)
     rest = np.asarray([k for k in range(gram.shape[-1]) if k not in own])

@@ -2,10 +2,7 @@
 
 from .closure import Closure as Closure
 from .discover import discover as discover
-from .plan import Plan as Plan
 from .plan import Power as Power
-from .plan import planned_base as planned_base
-from .plan import power as power
 from .plan import power_of_campaign as power_of_campaign
 from .result import Discovery as Discovery
 from .result import Effect as Effect

@@ -17,6 +17,7 @@ from scipy.special import softmax
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..calibrate.forward import Forms
+from ..calibrate.population import COEFFICIENTS
 from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD, Record
 from ..geometry import Particle
 from .base import Base
@@ -35,27 +36,21 @@ LEAD = 3.0  # log posterior odds from which on what remains next to a name is re
 
 
 def parameters_with(search: Search) -> dict[str, Any]:
-    """The population's parameters, averaged over hypotheses (Bayesian model averaging, Hoeting et al. 1999).
-
-    These are the most probable ones that are fitted, as many as hold what a set must.
-    """
-    likely: dict[Names, float] = {}
+    """The population's parameters, averaged over the most probable hypotheses (Hoeting et al. 1999)."""
+    each, weights = [], []
     for names, probability in search.posterior().items():
-        if sum(likely.values()) < DECISIONS.set_mass and search.found[names].at is not None:
-            likely[names] = probability
-    found = [search.found[names] for names in likely]
-    each = [population_under(search.base, one.at, *one.likely_form()) for one in found]
-    return averaged(each, np.array(list(likely.values())) / sum(likely.values()), len(search.base.tests))
+        one = search.found[names]
+        if sum(weights) < DECISIONS.set_mass and one.at is not None:
+            each.append(population_under(search.base, one.at, *one.likely_form()))
+            weights.append(probability)
+    return averaged(each, np.array(weights) / sum(weights), len(search.base.tests))
 
 
 def averaged(
     each: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], weights: np.ndarray, particles: int
 ) -> dict[str, Any]:
-    """Parameters by name from means, errors and spreads, which are weighted.
-
-    The mean of log C over particles whose spread is estimated from the same particles follows Student's t with one
-    degree of freedom less than there are particles; a and the modulus, which no spread of particles limits, are normal.
-    """
+    """Parameters by name from means, errors and spreads, which are weighted: log C as Student's t with one degree of
+    freedom less than there are particles, a and the modulus, which no spread of particles limits, as normal."""
     from scipy.optimize import root_scalar
     from scipy.stats import t as student
 
@@ -76,52 +71,42 @@ def averaged(
 
         return root_scalar(below, bracket=(least[j], most[j])).root
 
-    def entry(j: int) -> dict[str, Any]:
-        return estimate(float(middle[j]), float(wide[j]), (quantile(0.025, j), quantile(0.975, j)))
+    def modulus(log: float, sd: float, ends: tuple[float, float]) -> dict[str, Any]:
+        return estimate(math.exp(log), math.exp(log) * sd, (math.exp(ends[0]), math.exp(ends[1])))
 
-    def modulus(j: int) -> dict[str, Any]:
-        value = math.exp(middle[j])
-        return estimate(value, value * float(wide[j]), (math.exp(quantile(0.025, j)), math.exp(quantile(0.975, j))))
-
-    coefficients = {
-        f"log_C{2 * j + 1}": {"mean": entry(2 + j), "sd": estimate(float(weights @ tau[:, j]))} for j in range(3)
-    }
-    return {"a": entry(0), "effective_modulus_MPa": modulus(1), AT_PEAKS: modulus(5), **coefficients}
+    numbers = zip(middle.tolist(), wide.tolist(), range(len(middle)), strict=True)
+    a, log_modulus, *logs, at_peaks = [(m, sd, (quantile(0.025, j), quantile(0.975, j))) for m, sd, j in numbers]
+    spreads = map(estimate, (weights @ tau).tolist())
+    coefficients = zip(COEFFICIENTS, logs, spreads, strict=True)
+    found = {"a": estimate(*a), "effective_modulus_MPa": modulus(*log_modulus), AT_PEAKS: modulus(*at_peaks)}
+    return found | {f"log_{name}": {"mean": estimate(*log), "sd": sd} for name, log, sd in coefficients}
 
 
 def population_under(
     base: Base, formulas: Fitted | None, hyper: np.ndarray, design: Design
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, and the
-    spreads of the coefficients.
-
-    Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
-    is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
-    """
+    """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, which a
+    misfit widens (Brynjarsdottir and O'Hagan 2014), and the spreads of the coefficients."""
     model = LinearModel(hyper, design)
     solution, covariance, width = model.solve(), model.covariance(), design.common.shape[-1]
     mean, factor = base.population_prior
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
     rows = np.zeros((POPULATION + 1, len(covariance)))
     rows[:POPULATION, :POPULATION] = factor
-    change, slope = (0.0, np.zeros(0)) if formulas is None else _modulus_at_peaks(base, formulas, solution)
-    names = 0 if formulas is None else len(formulas.variants)
-    rows[-1] = rows[1]
-    rows[-1, width : width + names] += slope[:names]
-    rows[-1, POPULATION : POPULATION + len(slope) - names] += slope[names:]
+    rows[-1], at_peaks = rows[1], beta[1]
+    if formulas is not None:
+        change, slope = _modulus_at_peaks(base, formulas, solution)
+        names, at_peaks = len(formulas.variants), beta[1] + change
+        rows[-1, width : width + names] += slope[:names]
+        rows[-1, POPULATION : POPULATION + len(slope) - names] += slope[names:]
     sd = np.sqrt(np.diagonal(rows @ covariance @ rows.T))
-    at_peaks = beta[1] + change
     beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * base.flatness, -0.99)))
     return np.append(beta, at_peaks), sd, model.scales[0][:3]
 
 
 def _modulus_at_peaks(base: Base, formulas: Fitted, solution: Solution) -> tuple[float, np.ndarray]:
-    """Mean logarithm of what effects make of the modulus at every test's largest force, and its derivatives.
-
-    Each formula has a strain, a size or a humidity of its own at which its modulus is that of the law: extrapolated
-    there, it may be twice what acts in the tests. At their peaks all formulas that describe the tests agree.
-    Derivatives are by the amplitudes and then by the further numbers, each in units of its column.
-    """
+    """Mean logarithm of what effects make of the modulus at every test's largest force, where all good formulas agree,
+    and its derivatives by amplitudes and then further numbers, in units of their columns."""
     variants, names = formulas.variants, len(formulas.variants)
     forms, state = Forms(base.model.unloading, variants), formulas.state
     at = jnp.asarray(moved(base, state, variants, solution).point.theta[0])
@@ -206,26 +191,22 @@ def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
 def sets_of(
     search: Search, leader: Names, effects: Sequence[Effect], pairs: Sequence[Names]
 ) -> tuple[tuple[str, ...], ...]:
-    """For each effect that was added, the mechanisms that may be in its place, most probable first, itself among them.
-
-    Those of `pairs`, two names each that may be in place of a single one, come last.
-    """
+    """For each effect that was added, itself and what may be in its place, most probable first; those of `pairs`
+    last."""
     alike = {names: one for names, one in search.found.items() if len(names) == len(leader) and names != UNLISTED}
     found = []
     for effect in effects:
         others = {e.mechanism for e in effects if e is not effect}
-        rivals = {
-            name: one.log_evidence
-            for names, one in alike.items()
-            if others <= set(names)
-            for name in set(names) - others
-        }
-        held, members = 0.0, []
+        rivals = {}
+        for names, one in alike.items():
+            if others <= set(names):
+                rivals |= dict.fromkeys(set(names) - others, one.log_evidence)
+        held, members = 0.0, [effect.mechanism]
         for name, share in sorted(_shares(rivals).items(), key=lambda one: -one[1]):
             if held < DECISIONS.set_mass:
                 members.append(name)
                 held += share
-        found.append(tuple(dict.fromkeys([effect.mechanism, *members, *(n for pair in pairs for n in pair)])))
+        found.append(tuple(dict.fromkeys([*members, *(n for pair in pairs for n in pair)])))
     return tuple(found)
 
 
@@ -284,13 +265,11 @@ def likeness_of(search: Search, sets: Sequence[Sequence[str]], ranking: Sequence
     screen = search.screen
     value, mechanisms = screen.singles(), screen.candidates.mechanisms
     wanted = dict.fromkeys([name for names in sets for name in names] + [entry["mechanism"] for entry in ranking])
-    best = {
-        name: max(np.flatnonzero(mechanisms == name), key=lambda k: value[k]) for name in wanted if name in mechanisms
-    }
-    rows = np.array(list(best.values()), int)
+    names = [name for name in wanted if name in mechanisms]
+    rows = np.array([max(np.flatnonzero(mechanisms == name), key=lambda k: value[k]) for name in names], int)
     score, signs = screen.score[0][rows], screen.candidates.signs[rows]
     sign = np.where(signs == 0, np.where(score < 0, -1, 1), signs)
-    return Likeness(tuple(best), screen.similarity[np.ix_(rows, rows)] * sign * sign[:, None])
+    return Likeness(tuple(names), screen.similarity[np.ix_(rows, rows)] * sign * sign[:, None])
 
 
 def residuals_of(base: Base, nothing: Fitted, fitted: Fitted) -> Residuals:
@@ -298,15 +277,9 @@ def residuals_of(base: Base, nothing: Fitted, fitted: Fitted) -> Residuals:
     before, after = (residual_of(one.solution, one.design) for one in (nothing, fitted))
     white_before, _ = whitened(fitted.optimum.hyper, fitted.design, before)
     white_after, sd = whitened(fitted.optimum.hyper, fitted.design, after)
-    record, mask = base.tests.record, np.asarray(base.tests.mask)
-
-    def shown(x: np.ndarray) -> np.ndarray:
-        return np.where(mask, x, 0.0)
-
-    return Residuals(
-        np.asarray(record.time), np.asarray(record.kind), mask, shown(before), shown(after), shown(white_before),
-        shown(white_after), shown(sd), tuple(base.selection.kept),
-    )  # fmt: skip
+    record, mask, kept = base.tests.record, np.asarray(base.tests.mask), tuple(base.selection.kept)
+    shown = (np.where(mask, x, 0.0) for x in (before, after, white_before, white_after, sd))
+    return Residuals(np.asarray(record.time), np.asarray(record.kind), mask, *shown, particles=kept)
 
 
 def places(base: Base, left: np.ndarray) -> tuple[Place, ...]:
@@ -343,15 +316,9 @@ def where(base: Base, places: Sequence[Place]) -> list[dict[str, Any]]:
         if held >= REPORTED:
             break
         held += place.share
-        rows = list(place.particles)
-        found.append(
-            {
-                "segment": place.segment,
-                "load_fraction": list(place.load_fraction),
-                "strain": [float(least[rows].min()), float(most[rows].max())],
-                "share": place.share,
-                "particles": [base.names[i] for i in rows],
-                "direction": f"{'more' if place.sign > 0 else 'less'} displacement than the law",
-            }
-        )
+        rows, direction = list(place.particles), "more" if place.sign > 0 else "less"
+        entry = {"segment": place.segment, "load_fraction": list(place.load_fraction)}
+        entry |= {"strain": [float(least[rows].min()), float(most[rows].max())], "share": place.share}
+        entry |= {"particles": [base.names[i] for i in rows], "direction": f"{direction} displacement than the law"}
+        found.append(entry)
     return found

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._types import Progress
 from ..calibrate.data import Selection, Tests, ranges_um, root_mean_squares
 from ..calibrate.fitting import in_own_units, prepare
-from ..calibrate.forward import Forms, Point
+from ..calibrate.forward import Point
 from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.numpyro_model import Model
 from ..calibrate.particle_fit import snaps
@@ -52,12 +52,6 @@ class Base:
     threshold_MPa: float  # stress below which points do not count
     coarse: bool  # whether few readings of each branch are compared, see `base_fit`
     rms_um: np.ndarray  # residual of each particle's own fit
-    range_um: np.ndarray  # of the displacement of every test
-
-    @property
-    def forms(self) -> Forms:
-        """Formulas of the base law."""
-        return Forms(self.model.unloading)
 
     @cached_property
     def flatness(self) -> np.ndarray:
@@ -92,10 +86,9 @@ class Base:
 def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress: Progress) -> Base:
     """Fit the base law to a campaign; InputError if no particle can be used, or the numbers are beyond arithmetic.
 
-    Of a material that the law was not made for, and does not fit, only some readings of each branch are compared: what
-    is left is every particle's own over a good part of its branch, so that neighbouring readings agree, and
-    hundreds of them would decide by how smooth they are. That is a coarsened posterior (Miller and Dunson 2019, J. Am.
-    Stat. Assoc. 114, 1113).
+    Of a material that the law does not fit only some readings of each branch are compared: what is left is smooth over
+    a good part of a branch, and hundreds of readings would decide by how smooth. That is a coarsened posterior
+    (Miller and Dunson 2019, J. Am. Stat. Assoc. 114, 1113).
     """
     with numbers_in_reach(campaign):
         model, foreign = in_own_units(campaign, model)
@@ -106,25 +99,16 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress
             branches = int(np.median([len(find_segments(curve)) for curve in campaign.curves]))
             most = DECISIONS.readings * branches
             selection, fit = prepare(campaign, model, threshold_MPa, most_points=most, progress=progress)
-    p = fit.population
+    p, priors, noise = fit.population, model.chosen_priors, fit.noise.noise
     shift = np.mean(np.log1p(np.asarray(p.a) * np.asarray(fit.tests.flatness)))
     population = jnp.asarray(np.concatenate([[p.a, p.log_modulus], np.asarray(p.mu) + shift]))
-    priors = model.chosen_priors
     spreads = priors.tau_C1, priors.tau_C3, priors.tau_C5, priors.modulus_scatter
     found = np.maximum([*np.asarray(p.tau), max(float(p.modulus_scatter), 1e-3)], 1e-4)
     x = [float(SpreadCoordinate(prior).coordinate(tau)) for prior, tau in zip(spreads, found.tolist(), strict=True)]
+    # Where a spread is zero its coordinate has no slope: begin a little above it.
+    hyper = np.concatenate([np.asarray(noise.logs), np.maximum(x, 0.3)])
+    state = State(replace(fit.point, theta=jnp.zeros((len(fit.tests), 0))), population)
+    scale, rms_um = np.asarray(noise.scale), root_mean_squares(fit.tests, fit.residual)
     return Base(
-        campaign=campaign,
-        selection=selection,
-        model=model,
-        tests=fit.tests,
-        scale=np.asarray(fit.noise.noise.scale),
-        state=State(replace(fit.point, theta=jnp.zeros((len(fit.tests), 0))), population),
-        # Where a spread is zero its coordinate has no slope: begin a little above it.
-        hyperparameters=np.concatenate([np.asarray(fit.noise.noise.logs), np.maximum(x, 0.3)]),
-        spreads=spreads,
-        threshold_MPa=threshold_MPa,
-        coarse=coarse,
-        rms_um=root_mean_squares(fit.tests, fit.residual),
-        range_um=ranges_um(fit.tests),
-    )
+        campaign, selection, model, fit.tests, scale, state, hyper, spreads, threshold_MPa, coarse, rms_um
+    )  # fmt: skip

@@ -31,29 +31,18 @@ LETTERS = {
 
 @dataclass(frozen=True)
 class Closure:
-    """An addition to displacement found from the data, in units of strain (times D_e).
+    """An addition to displacement found from the data, in units of strain (times D_e)."""
 
-    Attributes:
-        formula: as text, of at most two terms with rounded numbers.
-        coordinate: which coordinate explains most of it.
-        x, added, sd: the curve along it, in units of strain, and its standard error.
-        selection_frequency: share of resamples of the particles in which the same coordinate explains most.
-        resembles: mechanisms whose projected signatures it resembles, with the cosine, best first.
-        span: range of the coordinates over which it was found.
-        correction_um, held_out_um: displacement that it adds at every point, shape (N, points): by all tests, and by
-            the tests without the one it is for.
-    """
-
-    formula: str
-    coordinate: str
-    x: np.ndarray
-    added: np.ndarray
-    sd: np.ndarray
-    selection_frequency: float
-    resembles: tuple[tuple[str, float], ...]
-    span: dict[str, tuple[float, float]]
-    correction_um: np.ndarray
-    held_out_um: np.ndarray
+    formula: str  # of at most two terms with rounded numbers
+    coordinate: str  # which coordinate explains most of it
+    x: np.ndarray  # the curve along it
+    added: np.ndarray  # in units of strain
+    sd: np.ndarray  # its standard error
+    selection_frequency: float  # share of resamples of the particles in which the same coordinate explains most
+    resembles: tuple[tuple[str, float], ...]  # mechanisms with projected signatures like it, and the cosine, best first
+    span: dict[str, tuple[float, float]]  # range of the coordinates over which it was found
+    correction_um: np.ndarray  # displacement that it adds at every point, shape (N, points)
+    held_out_um: np.ndarray  # the same by the tests without the one it is for
 
     __repr__ = described()
 
@@ -118,8 +107,7 @@ def closure(search: Search, seed: int) -> Closure:
     again = [_best_terms(model, len(terms), rng.choice(everyone, len(everyone)), one=True)[0][0] for _ in range(20)]
     name = terms[chosen[0]][0]
     texts = [f"{_rounded(w / scale[k]):+g} {terms[k][1]}" for k, w in zip(chosen, weights, strict=True)]
-    letters = dict.fromkeys(terms[k][0] for k in chosen)
-    meaning = ", ".join(f"{LETTERS[n][0]} = {LETTERS[n][1]}" for n in letters)
+    meanings = dict.fromkeys(" = ".join(LETTERS[terms[k][0]]) for k in chosen)
     # Weights along the coordinate have the size that the smooth discrepancy was found to have, in units of strain.
     unit = float(np.sqrt(np.mean((curve / size[:, None])[mask] ** 2)))
     basis = np.where(mask[..., None], _cosines(search.at[name]) * size[:, None, None], 0.0)
@@ -131,7 +119,7 @@ def closure(search: Search, seed: int) -> Closure:
     others = np.array([smoothed.numbers(np.delete(everyone, i))[0][: len(fixed)][~fixed] for i in everyone])
     held_out = np.einsum("npc,nc->np", whole.common[..., ~fixed], others * smoothed.scales[1][~fixed])
     return Closure(
-        formula=f"added displacement / D_e = {' '.join(texts)}; {meaning}",
+        formula=f"added displacement / D_e = {' '.join(texts)}; {', '.join(meanings)}",
         coordinate=name,
         x=np.linspace(*span[name], POINTS),
         added=there @ (covariance @ shared.score),
@@ -153,17 +141,14 @@ def _best_terms(
     power = np.maximum(np.diagonal(G), 1e-300)
     single = s**2 / power
     first = int(np.argmax(single))
-    if not one:
-        pairs = []
-        for i, j in combinations(np.argsort(-single)[:SHORTLIST].tolist(), 2):
-            inner = G[np.ix_([i, j], [i, j])]
-            if np.linalg.cond(inner) < 1e6:
-                w = np.linalg.solve(inner, s[[i, j]])
-                pairs.append((float(w @ s[[i, j]]), (i, j), w))
-        best = max(pairs, key=lambda p: p[0], default=None)
-        if best is not None and single[first] <= ONE_TERM * best[0]:
-            return best[1:]
-    return (first,), np.array([s[first] / power[first]])
+    chosen, weights, most = (first,), np.array([s[first] / power[first]]), single[first] / ONE_TERM
+    for i, j in combinations(np.argsort(-single)[: 0 if one else SHORTLIST].tolist(), 2):
+        inner = G[np.ix_([i, j], [i, j])]
+        if np.linalg.cond(inner) < 1e6:
+            w = np.linalg.solve(inner, s[[i, j]])
+            if w @ s[[i, j]] > most:
+                chosen, weights, most = (i, j), w, w @ s[[i, j]]
+    return chosen, weights
 
 
 def _cosines(x: np.ndarray) -> np.ndarray:
@@ -178,7 +163,6 @@ def _resembling(search: Search, model: LinearModel, place: int) -> tuple[tuple[s
     own = max(G[place, place], 1e-300)
     cosine = G[place, place + 1 :] / np.sqrt(own * np.maximum(np.diagonal(G)[place + 1 :], 1e-300))
     cosine = np.where(candidates.signs == 0, np.abs(cosine), cosine * candidates.signs)
-    best: dict[str, float] = {}
-    for c, value in zip(candidates.each, cosine.tolist(), strict=True):
-        best[c.mechanism] = max(best.get(c.mechanism, -1.0), value)
+    alike = sorted(zip((c.mechanism for c in candidates.each), cosine.tolist(), strict=True), key=lambda one: one[1])
+    best = dict(alike)  # of each mechanism the formula that is most like it
     return tuple(sorted(((n, v) for n, v in best.items() if v > 0.3), key=lambda pair: -pair[1])[:5])

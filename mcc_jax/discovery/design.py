@@ -93,10 +93,7 @@ class Columns:
         return jnp.asarray(hyper[:4]), *self.arrays, piece, self.correlation
 
     def _whitened(self, hyper: np.ndarray) -> White:
-        """The columns that are not zero, padded.
-
-        Those at the hyperparameters of the last call are kept, since most are asked for more than once.
-        """
+        """The columns that are not zero, padded; those of the last call are kept."""
         noise = np.asarray(hyper[:4], float).tobytes()
         last = self._white  # another thread may put its own in place meanwhile
         if last is not None and last[0] == noise:
@@ -113,8 +110,7 @@ class Columns:
         return white._replace(columns=columns)
 
     def gram(self, hyper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gram matrix of every particle's whitened columns, the readings' squares with the data's; log density of the
-        noise at 0."""
+        """Gram matrix of every particle's whitened columns, and log density of the noise at 0."""
         white, last = self._whitened(hyper), self._gram
         if last is not None and last[0] is white:
             return last[1], white.log_density
@@ -125,8 +121,8 @@ class Columns:
         return gram, white.log_density
 
     def slope(self, hyper: np.ndarray, of_gram: np.ndarray) -> np.ndarray:
-        """Derivatives of something by the noise's numbers, from those by the Gram matrices; the noise's log density is
-        part of it."""
+        """Derivatives of something plus the noise's log density by the noise's numbers, from those by the Gram
+        matrices."""
         white, k = self._whitened(hyper).columns, len(self.some)
         padded = np.zeros((self.shape[0], white.shape[-1], white.shape[-1]))
         padded[:, :k, :k] = 2 * of_gram[:, self.some[:, None], self.some]
@@ -246,8 +242,7 @@ def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear
 
 
 def further_priors(variants: Sequence[Variant]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Prior means and standard deviations of the formulas' further numbers, of the logarithms of those that must be
-    positive; and which must."""
+    """Prior means and sds of the formulas' further numbers, of the logarithm of positive ones; and which these are."""
     each = [n for v in variants for n in v.nuisances]
     mean, sd = np.array([nuisance_moments(n) for n in each]).reshape(-1, 2).T
     return mean, sd, np.array([n.plausible[0] > 0 for n in each], bool)
@@ -269,9 +264,6 @@ def _means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) ->
 
 
 def particle_means(population: Any, flatness: Any, power: float) -> tuple[np.ndarray, np.ndarray]:
-    """Means of the particles' b1, b3, b5, e under the population, and their derivatives by the population.
-
-    b1, b3, b5 of the population are those at the campaign's average shape; its mean, as a, is taken in by the prior.
-    """
+    """Means of the particles' b1, b3, b5, e under a population at the average shape, and their derivatives by it."""
     means, slope = _means_and_slope(jnp.asarray(population), jnp.asarray(flatness), power)
     return np.asarray(means), np.asarray(slope)

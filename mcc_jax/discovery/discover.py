@@ -15,7 +15,7 @@ from .._errors import InputError
 from .._types import Progress
 from ..calibrate import Model, sample
 from ..calibrate.compiling import one_blas_thread
-from ..calibrate.data import root_mean_squares
+from ..calibrate.data import ranges_um, root_mean_squares
 from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import LEAST_LEFT, numbers_in_reach, unlike_others
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
@@ -36,6 +36,7 @@ from .settings import AT_PEAKS
 from .verify import held_out, p_anything
 
 LEAST = 3  # particles of which one can be held out
+LINEAR = "amplitudes and parameters are those of the linear model at its optimum"
 
 
 @one_blas_thread
@@ -86,8 +87,7 @@ def discover(
         arguments.flag(value, name)
     known = dict(LIBRARY if library is None else library)
     for name in exclude:
-        if name not in known:
-            raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
+        arguments.choice(name, known, "mechanism")
         known.pop(name)
     findings = campaign_findings(campaign)
     wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "error"]
@@ -95,7 +95,8 @@ def discover(
         summary = f"These numbers are implausible: {wrong[0]} Nothing is looked for before that is settled."
         found = Discovery("FIT_NOT_CONVERGED", summary, None, None, seed, 0.0)
         return _finished(found, (*wrong, *findings), started)
-    begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, progress=progress)
+    fitted = partial(base_fit, model=without_effects(assumed), threshold_MPa=threshold_MPa, progress=progress)
+    begun = partial(_begun, fitted=fitted, known=known, progress=progress)
     search = begun(campaign, findings)
     _run(search, seed)
     if search.is_gap:
@@ -109,12 +110,12 @@ def discover(
     if len(base.tests) < LEAST:
         notes.append("of fewer than three particles none can be held out: what is found rests on the noise model alone")
     found = Discovery(
-        "NO_GAP",
-        "",
-        base,
-        base.model,
-        seed,
-        0.0,
+        verdict="NO_GAP",
+        summary="",
+        base=base,
+        model=base.model,
+        seed=seed,
+        runtime_s=0.0,
         ranking=ranking,
         untestable=tuple(search.untestable),
         p_any=search.p_any,
@@ -129,21 +130,18 @@ def discover(
         progress("held-out particles")
         held = held_out(search, winner)
         found = replace(found, held_out=held)
-        objection = held.objection([root_mean_squares(base.tests, one) for one in held.residual_um], base.range_um)
-        if objection is not None:
+        rms_um = [root_mean_squares(base.tests, one) for one in held.residual_um]
+        if objection := held.objection(rms_um, ranges_um(base.tests)):
             summary = taken_back(() if winner == UNLISTED else winner, objection)
             found = replace(_of_law_alone(found, search), verdict="FIT_NOT_CONVERGED", summary=summary)
             return _finished(found, findings, started)
     found = _named(found, search, winner, known)
     separate = [e.mechanism for e in found.effects if located(e.variant)]
     if separate:
-        note = (
-            f"{', '.join(separate)} differs from test to test: it is no part of the model found, and amplitudes and "
-            "parameters are those of the linear model at its optimum"
-        )
+        note = f"{', '.join(separate)} differs from test to test: it is no part of the model found, and {LINEAR}"
         found = replace(found, notes=(*found.notes, note))
     elif posterior and found.effects:
-        found = _sampled(found, search, winner, threshold_MPa)
+        found = _sampled(found, search, winner)
     if experiments and len(found.candidate_set) == 1:
         progress("next experiments")
         paired = {name for pair in found.pairs for name in pair}
@@ -156,13 +154,12 @@ def _begun(
     campaign: Campaign,
     findings: Sequence[Finding],
     *,
-    model: Model,
+    fitted: Callable[[Campaign], Base],
     known: Mapping[str, Mechanism],
-    threshold_MPa: float,
     progress: Progress,
 ) -> Search:
     """The search with the law alone in it."""
-    base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, progress)
+    base, left_out = _settled_fit(campaign, findings, fitted)
     known = without_punch(known, base)
     testable, missing = untestable(known, available_data(campaign))
     if not testable:
@@ -175,21 +172,18 @@ def _begun(
 
 
 def _settled_fit(
-    campaign: Campaign, findings: Sequence[Finding], model: Model, threshold_MPa: float, progress: Progress
+    campaign: Campaign, findings: Sequence[Finding], fitted: Callable[[Campaign], Base]
 ) -> tuple[Base, list[Finding]]:
-    """The base fit of the tests that are of one kind, and what is said of those left out.
-
-    Particles whose turning point cannot be relied on, and those whose residual is unlike all others', would be taken
-    for physics. They take no part in the search.
-    """
+    """The base fit without what would be taken for physics: tests that cannot be relied on or whose residual is unlike
+    all others'; and what is said of these."""
     unsafe = tuple(dict.fromkeys(name for one in findings if one.level == "error" for name in one.particles))
     left_out = []
     if unsafe and len(unsafe) < len(campaign):
         text = f"{named(unsafe, len(campaign))}: cannot be relied on, as said above; no part in the search"
         left_out.append(Finding("left out", "warning", text, "", unsafe))
         campaign = campaign.without(*unsafe)
-    base = base_fit(campaign, model, threshold_MPa=threshold_MPa, progress=progress)
-    outlying, without = unlike_others(base.names, base.rms_um, base.range_um), ()
+    base = fitted(campaign)
+    outlying, without = unlike_others(base.names, base.rms_um, ranges_um(base.tests)), ()
     snapping = tuple(name for name, low in zip(base.names, base.snaps, strict=True) if low)
     if outlying is not None:
         left_out.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
@@ -200,7 +194,7 @@ def _settled_fit(
         left_out.append(Finding("snap-through", "info", text, "", snapping))
         without = tuple(dict.fromkeys((*without, *snapping)))
     if without:
-        base = base_fit(campaign.without(*without), model, threshold_MPa=threshold_MPa, progress=progress)
+        base = fitted(campaign.without(*without))
     return base, left_out
 
 
@@ -213,10 +207,8 @@ def _run(search: Search, seed: int) -> None:
 
 
 def _not_tared(campaign: Campaign, search: Search, begun: Callable[..., Search], seed: int) -> Search | None:
-    """The search with what the tests begin at taken off their force, where the law alone then does; None elsewhere.
-
-    Its evidence must be larger than that of anything named with the zero of the file, and nothing may be missing there.
-    """
+    """The search with what the tests begin at taken off their force, if then nothing is missing and the evidence is
+    larger than that of anything named with the zero of the file; else None."""
     zero = open_zero(campaign)
     if zero is None:
         return None
@@ -280,26 +272,18 @@ def _named(found: Discovery, search: Search, winner: Names, known: Mapping[str, 
     )
 
 
-def _sampled(found: Discovery, search: Search, winner: Names, threshold_MPa: float) -> Discovery:
+def _sampled(found: Discovery, search: Search, winner: Names) -> Discovery:
     """The answer with the posterior of the law with effects, if it may be believed."""
     search.progress("posterior of the law with effects")
-    base, fitted = search.base, search.found[winner].at
-    same = fitted is not None and found.model is not None and fitted.variants == found.model.effects
-    drawn = sample(
-        base.campaign,
-        found.model,
-        threshold_MPa=threshold_MPa,
-        seed=found.seed,
-        without_flagged=False,
-        start=fitted.start(base) if fitted is not None and same else None,
-        progress=search.progress,
-    )
+    base, fitted, model = search.base, search.found[winner].at, found.model
+    assert fitted is not None
+    assert model is not None
+    start = fitted.start(base) if fitted.variants == model.effects else None
+    given: dict[str, Any] = {"threshold_MPa": base.threshold_MPa, "seed": found.seed, "progress": search.progress}
+    drawn = sample(base.campaign, model, without_flagged=False, start=start, **given)
     found = replace(found, posterior=drawn)
     if drawn.failures():
-        note = (
-            f"the posterior of the law with effects has not converged ({'; '.join(drawn.failures())}); amplitudes and "
-            "parameters are those of the linear model at its optimum"
-        )
+        note = f"the posterior of the law with effects has not converged ({'; '.join(drawn.failures())}); {LINEAR}"
         return replace(found, notes=(*found.notes, note))
     found = replace(found, effects=tuple(answer.with_draws(effect, drawn) for effect in found.effects))
     if found.verdict == "SET" or any(effect.misfit for effect in found.effects):

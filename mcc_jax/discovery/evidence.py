@@ -129,8 +129,7 @@ def marginalise(gram: np.ndarray, count: int) -> Marginalised:
 
 
 class Amplitudes(NamedTuple):
-    """Log integral over amplitudes, their mean and standard deviation under the best scales, and the integral's
-    derivatives by the quadratic form."""
+    """Log integral over amplitudes, its derivatives by the quadratic form, and mean and sd under the best scales."""
 
     log_integral: float
     mean: np.ndarray
@@ -139,11 +138,11 @@ class Amplitudes(NamedTuple):
 
 
 def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Amplitudes:
-    """Integrate amplitudes out.
+    """Integrate amplitudes out, each with an equal mixture of half-normal priors (normal where both signs are
+    physical).
 
-    Each has an equal mixture of half-normal priors (normal where both signs are physical), whose scales are spread
-    evenly in the logarithm from 1 to `largest`. Where several are cut, the corner's probability is taken for the
-    product of the single ones.
+    Their scales are spread evenly in the logarithm from 1 to `largest`. Where several are cut, the corner's probability
+    is taken for the product of the single ones.
     """
     count, gram, score = len(sign), left[:-1, :-1], left[:-1, -1]
     axes = np.meshgrid(*[np.linspace(0, 1, SCALES)] * count, indexing="ij")
@@ -190,10 +189,7 @@ def _of_shared(gram: np.ndarray, design: Design) -> tuple[float, float, np.ndarr
 
 
 def value_and_gradient(hyper: np.ndarray, design: Design, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
-    """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives.
-
-    Those by the noise cost more than all others; without `of_noise` they lack the likelihood's part.
-    """
+    """Log marginal likelihood times prior, and its derivatives; by the noise, which cost most, only if `of_noise`."""
     o, c = design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
         model = LinearModel(hyper, design)
@@ -336,8 +332,7 @@ class _Surface:
         return float(found.fun), np.append(x[: self.first], found.x)
 
     def likely(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The best of several settings of correlated noise, if it is clearly better than the one given: what was fitted
-        without misfits may have swallowed what they explain."""
+        """The mode, or that of another setting of correlated noise, which may have swallowed what misfits explain."""
         shorter = LENGTH_FACTORS[-1]
         factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NOISE_FACTORS[1:])])
         some = [self.followed(np.concatenate([x[:2], x[2:4] + by / self.scale[2:4], x[4:]])) for by in factors]
@@ -364,8 +359,7 @@ class _Surface:
         return value, at, slope
 
     def log_volume(self, x: np.ndarray, jac: np.ndarray, known: int) -> float:
-        """What Laplace's method adds for the hyperparameters at their mode, where the slope is `jac`, but for the first
-        `known` ones."""
+        """What Laplace's method adds for all but the first `known` hyperparameters at their mode, of slope `jac`."""
         scale, first = self.scale, self.first
         bound = x * scale >= self.most * scale - 1e-6
         volume = -float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
@@ -397,9 +391,8 @@ def likely_start(design: Design, start: np.ndarray) -> tuple[np.ndarray, float]:
 def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
-    Without `curvature` they are not integrated out: `log_evidence` is the log posterior at the mode. The curvature of
-    an optimum `without` misfits is taken for that of the hyperparameters it has. Raises FloatingPointError where there
-    is no evidence at the start.
+    Without `curvature`, `log_evidence` is the log posterior at the mode. The curvature of an optimum `without` misfits
+    is taken for that of the hyperparameters it has. Raises FloatingPointError where there is no evidence at the start.
     """
     surface = _Surface(design)
     value, x, jac = surface.mode(np.minimum(start / surface.scale, surface.most))
@@ -427,7 +420,6 @@ def residual_of(solution: Solution, design: Design) -> Float[np.ndarray, "partic
 
 
 def whitened(hyper: np.ndarray, design: Design, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values over the points [um], independent and of variance 1, and the standard deviation of each point given those
-    before it."""
+    """Values over the points [um], independent and of variance 1, and the sd of each point given those before it."""
     white = Columns(values[..., None], design).white(hyper)
     return white.columns[..., 0], white.sd

@@ -82,10 +82,7 @@ def fit_hypothesis(
     hyper: np.ndarray,
     more: ExtraColumns = NO_EXTRA,
 ) -> Fitted:
-    """The optimum of a hypothesis, hyperparameters at their mode at every step.
-
-    It begins at a state of the base law and at `numbers` of the effects: amplitudes of zero and further numbers.
-    """
+    """The optimum of a hypothesis by Gauss-Newton, from a state of the base law and `numbers` of the effects."""
     state, value = state.with_numbers(np.asarray(numbers)), -np.inf
     before = state
     design = design_of(base, state, variants, more)
@@ -115,8 +112,8 @@ def fit_hypothesis(
 def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
     """The state at a solution, or on the way there: no positive number moves by more than a factor of e.
 
-    All numbers go the same share of the way, since an amplitude that is right at the solution is wrong with further
-    numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: the data say nothing of them.
+    All numbers go the same share of the way: an amplitude that is right at the solution is wrong with further numbers
+    that stayed behind. Those of an effect whose amplitude is zero stay: the data say nothing of them.
     """
     middle, factor = base.population_prior
     beta = middle + factor @ solution.common[:POPULATION]
@@ -143,8 +140,7 @@ def between(one: State, other: State, share: float = 0.5) -> State:
 
 
 def at_priors(base: Base, rows: np.ndarray) -> State:
-    """Where the base law fits, but for some tests at the priors' middle; the population, too, if they are most: there
-    the law is monotone, as tests are."""
+    """The base law's fit, but for some tests at the priors' middle; where these are most, the population, too."""
     mean, point = base.population_prior[0], base.state.point
     population = np.asarray(base.state.population)
     if 2 * rows.sum() > len(rows):
@@ -156,10 +152,8 @@ def at_priors(base: Base, rows: np.ndarray) -> State:
 
 
 def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
-    """The base law at its mode, under the kind of noise that the tests prefer: the model's own unless clearly not.
-
-    A search under noise that the tests do not have fits formulas to what the noise leaves.
-    """
+    """The base law at its mode under the kind of noise that the tests prefer: the model's own unless clearly not. Under
+    other noise formulas would be fitted to what the noise leaves."""
     design = design_of(base, base.state)
     own = optimise(design, base.hyperparameters, curvature=False)
     others = [(*_with_own_scales(design, own.hyper, model), model) for model in noise_models(base)]
@@ -170,8 +164,7 @@ def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
 
 
 def _with_own_scales(design: Design, hyper: np.ndarray, model: Model) -> tuple[Optimum, np.ndarray]:
-    """As `with_other_noise`, with the particles' own factors that belong to this kind of noise, and these: under noise
-    of another kind what wanders for long makes some particles look noisier than others."""
+    """As `with_other_noise`, with the particles' own factors that belong to this kind of noise, and these."""
     alike = replace(design, scale=np.ones(len(design.scale))).with_noise(model)
     found = with_other_noise(alike, hyper, model)
     white, _ = whitened(found.hyper, alike, residual_of(LinearModel(found.hyper, alike).solve(), alike))
@@ -185,8 +178,7 @@ def _with_own_scales(design: Design, hyper: np.ndarray, model: Model) -> tuple[O
 def with_other_noise(design: Design, hyper: np.ndarray, model: Model) -> Optimum:
     """The mode of the hyperparameters under the noise of a model, from the mode under another.
 
-    Its log density is -inf where the correlated noise is more than a misfit may be: a smooth curve of every test's own
-    describes any test, and leaves nothing for a law to explain.
+    Its log density is -inf where the correlated noise is more than a misfit may be: it would describe any test.
     """
     other, start = design.with_noise(model), hyper.copy()
     start[3] = other.noise[0, 3]  # the length's unit may be another
@@ -196,8 +188,7 @@ def with_other_noise(design: Design, hyper: np.ndarray, model: Model) -> Optimum
 
 
 def noise_models(base: Base) -> tuple[Model, ...]:
-    """The model with other kinds of noise, rough or smooth, along the load or in time; its length's prior keeps its
-    share of a test."""
+    """The model with other kinds of noise; the prior of the length of correlation keeps its share of a test."""
     tests, model, prior = base.tests, base.model, base.model.chosen_priors
     mask = np.asarray(tests.mask)
 

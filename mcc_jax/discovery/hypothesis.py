@@ -14,10 +14,10 @@ from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..effects import Variant
 from .base import Base, State
-from .design import NO_EXTRA, Columns, Design, ExtraColumns, design_of, linear_at
-from .evidence import LinearModel, likely_start, log_joint, optimise, scales_of, visible, with_little_noise
+from .design import NO_EXTRA, Design, ExtraColumns, design_of, linear_at
+from .evidence import LinearModel, likely_start, log_joint, optimise, visible, with_little_noise
 from .fit import Fitted, fit_hypothesis, moved
-from .screen import Candidate, Candidates, single_integrals
+from .screen import Candidates, single_integrals
 from .settings import DECISIONS, EARLY, HYPERPARAMETERS, VERY_STRONG
 
 Names = tuple[str, ...]
@@ -69,8 +69,7 @@ class Hypothesis:
         return tuple(float(x) for x in DECISIONS.misfit * np.exp(logs))
 
     def likely_form(self, *, misfit: bool = True) -> tuple[np.ndarray, Design]:
-        """Hyperparameters at their mode, and design, under the kind of noise that the tests prefer: with its misfit, if
-        they prefer that, too, and it is asked for."""
+        """Hyperparameters at their mode, and design, in the form and under the noise that the tests prefer."""
         assert self.at is not None
         hyper, design = self.at.optimum.hyper, self.at.design
         if misfit and self.is_off and self.misfit is not None:
@@ -87,10 +86,9 @@ class Hypothesis:
 def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, np.ndarray], np.ndarray]) -> None:
     """The form of a hypothesis where every name's formula may be wrong by a share of the effect.
 
-    Columns of a misfit are made at the amplitude of the formula alone. Where the amplitude is another with them, so is
-    the effect of which they may be a share: their prior follows it until both agree. Otherwise a formula that explains
-    nothing by itself would lend its name to what its misfit explains. `columns_of` gives those by which a formula may
-    be wrong that adds a curve to the tests.
+    Columns of a misfit, from `columns_of` by formula and the curve it adds, are made at the amplitude of the formula
+    alone. Where the amplitude is another with them, their prior follows it until both agree: otherwise a formula that
+    explains nothing by itself would lend its name to what its misfit explains.
     """
     r = one.at
     assert r is not None
@@ -140,8 +138,8 @@ class Discrepancy:
     log_white: float  # logarithm of the standard deviation of white noise, by which they are measured
 
     def added_to(self, base: Base, r: Fitted, at_least: float = -np.inf) -> Fitted | None:
-        """The law, or what is named, with the discrepancy in addition, at its optimum; None where it begins
-        `VERY_STRONG` below a log evidence to compare with."""
+        """The law, or what is named, with the discrepancy, at its optimum; None where it begins far below
+        `at_least`."""
         unit, count = float(np.log(DECISIONS.general)) + self.log_white, len(self.parts)
         more = ExtraColumns(misfits=self.parts, sizes=[(unit, DECISIONS.general_log_sd, np.inf)] * count)
         design = design_of(base, r.state, r.variants, more)
@@ -212,19 +210,8 @@ class RandomEffects:
         return self.log_evidence - self.at.log_evidence
 
 
-class _Tried(NamedTuple):
-    """A random amplitude before its hyperparameters are at their mode."""
-
-    log_joint: float
-    hyper: np.ndarray
-    candidate: Candidate
-    design: Design
-    more: ExtraColumns
-
-
 def random_amplitude(base: Base, start: Fitted, candidates: Candidates) -> RandomEffects | None:
-    """An amplitude that scatters around a common one, over all formulas of a mechanism, added to the base law or to a
-    formula at its optimum; None if none does."""
+    """An amplitude that scatters around a common one, over all formulas of a mechanism, added to a fit; or None."""
     hyper = np.append(start.optimum.hyper, 1.0)
     linear = linear_at(base, start.state, start.variants)
     tried = []
@@ -234,25 +221,25 @@ def random_amplitude(base: Base, start: Fitted, candidates: Candidates) -> Rando
             more = ExtraColumns((ratio * column,), (SPREAD,), (column,), (ratio,))
             design = design_of(base, start.state, start.variants, more, linear)
             each = [(log_joint(x, design), x) for x in (hyper, with_little_noise(hyper))]
-            tried.append(_Tried(*max(each, key=lambda one: one[0]), c, design, more))
+            tried.append((*max(each, key=lambda one: one[0]), c, design, more))
     if not tried:
         return None
-    tried.sort(key=lambda one: -one.log_joint)
-    fits = [optimise(one.design, one.hyper, curvature=False) for one in tried[:DRIFTS]]
-    logs = [*(fit.log_joint for fit in fits), *(one.log_joint for one in tried[DRIFTS:])]
+    tried.sort(key=lambda one: -one[0])
+    fits = [optimise(design, at, curvature=False) for _, at, _, design, _ in tried[:DRIFTS]]
+    logs = [*(fit.log_joint for fit in fits), *(one[0] for one in tried[DRIFTS:])]
     values: dict[str, list[float]] = {}
-    for value, one in zip(logs, tried, strict=True):
-        values.setdefault(one.candidate.variant.name, []).append(value)
+    for value, (_, _, candidate, *_) in zip(logs, tried, strict=True):
+        values.setdefault(candidate.variant.name, []).append(value)
     row = int(np.argmax([fit.log_joint for fit in fits]))
-    optimum, best = fits[row], tried[row]
+    optimum, (_, _, best, design, more) = fits[row], tried[row]
     if optimum.log_joint > start.optimum.log_joint:
         # Numbers of its own may be as large as anything else: what was linear without them is not with them.
-        at = fit_hypothesis(base, start.state, start.variants, start.theta, optimum.hyper, best.more)
+        at = fit_hypothesis(base, start.state, start.variants, start.theta, optimum.hyper, more)
     else:
-        at = replace(start, design=best.design, optimum=optimise(best.design, optimum.hyper))
+        at = replace(start, design=design, optimum=optimise(design, optimum.hyper))
     each = [logsumexp(v) - np.log(len(v)) for v in values.values()]
     total = float(logsumexp(each) - np.log(len(each))) + at.log_evidence - optimum.log_joint
-    return RandomEffects(best.candidate.variant, dict(best.candidate.nuisance), total, at, best.more)
+    return RandomEffects(best.variant, dict(best.nuisance), total, at, more)
 
 
 class Step(NamedTuple):
@@ -265,10 +252,8 @@ class Step(NamedTuple):
 
 
 def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects | None:
-    """Sudden steps in some tests, found one after the other, added to the base law or to a formula at its optimum.
-
-    A test has one with a probability that is itself unknown, uniformly; it may be at any point of its loading.
-    """
+    """Sudden steps in some tests, found one after the other, added to a fit; None without any. A test has one with a
+    probability that is itself unknown, uniformly, at any point of its loading."""
     mask = np.asarray(base.tests.mask)
     loading = np.asarray(base.tests.loading) & mask
     low, high = variant.plausible
@@ -292,7 +277,12 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects |
         more = ExtraColumns(columns, (SPREAD,) * (turn + 1))
         design = design_of(base, start.state, start.variants, more)
         optimum = optimise(design, np.concatenate([start.optimum.hyper, np.ones(turn + 1)]), curvature=False)
-        with_prior = optimum.log_joint + _log_prior_of_steps(found, loading)
+        # Which tests have steps, how many, and where.
+        with_steps = len({step.test for step in found})
+        several = (len(found) - with_steps) * np.log(0.5)
+        places = sum(np.log(max(loading[step.test].sum(), 1)) for step in found)
+        log_prior = float(betaln(with_steps + 1, len(loading) - with_steps + 1) + several - places)
+        with_prior = optimum.log_joint + log_prior
         if with_prior <= value:
             break
         value, now = with_prior, replace(start, design=design, optimum=optimum)
@@ -300,43 +290,21 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects |
     if best is None:
         return None
     at = fit_hypothesis(base, start.state, start.variants, start.theta, best.at.optimum.hyper, best.more)
-    jumps = _jumps(base, steps, unit * at.solution.own[:, 5:])
-    return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=jumps) if jumps else None
+    force, diameter, jumps = np.asarray(base.tests.force), np.asarray(base.tests.effective_diameter), []
+    for step in steps:
+        i, size = step.test, float(unit * at.solution.own[step.test, 5 + step.turn])
+        if size > 0:
+            stress = float(1e3 * force[i, step.point] / (np.pi * diameter[i] ** 2 / 4))
+            probability = float(expit((size / step.sd) ** 2 / 2 - np.log(len(force[i]))))
+            jumps.append(Jump(base.names[i], stress, size, step.sd, probability))
+    return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=tuple(jumps)) if jumps else None
 
 
 def step_scores(now: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """Score and information of a step of 1 um at every point, each particle's own numbers integrated out."""
-    design, hyper = now.design, now.optimum.hyper
-    _, P, o = design.own.shape
-    own, _ = scales_of(hyper, design)
+    design, points = now.design, now.design.data.shape[1]
     residual = design.data - design.common @ now.solution.common - design.amplitude @ now.solution.amplitude
-    steps = np.where(np.asarray(design.tests.mask)[..., None], np.tril(np.ones((P, P))), 0.0)
-    white = Columns(np.concatenate([design.own * own, steps, residual[..., None]], -1), design).white(hyper).columns
-    particle, step, data = white[..., :o], white[..., o:-1], white[..., -1]
-    turned = np.swapaxes(particle, 1, 2)
-    root = np.linalg.cholesky(turned @ particle + np.eye(o))
-    half = np.linalg.solve(root, turned @ white[..., o:])
-    score = np.einsum("npk,np->nk", step, data) - np.einsum("nok,no->nk", half[..., :-1], half[..., -1])
-    return score, np.sum(step**2, 1) - np.sum(half[..., :-1] ** 2, 1)
-
-
-def _log_prior_of_steps(found: Sequence[Step], loading: np.ndarray) -> float:
-    """Log prior of which tests have steps, how many, and where."""
-    N, k = len(loading), len({step.test for step in found})
-    places = sum(np.log(max(loading[step.test].sum(), 1)) for step in found)
-    several = (len(found) - k) * np.log(0.5)
-    return float(betaln(k + 1, N - k + 1) + several - places)
-
-
-def _jumps(base: Base, found: Sequence[Step], sizes: np.ndarray) -> tuple[Jump, ...]:
-    """The steps with their sizes, those of a turn in the turn's column."""
-    force, diameter = np.asarray(base.tests.force), np.asarray(base.tests.effective_diameter)
-    jumps = []
-    for step in found:
-        i = step.test
-        stress = 1e3 * force[i, step.point] / (np.pi * diameter[i] ** 2 / 4)
-        size = float(sizes[i, step.turn])
-        if size > 0:
-            probability = float(expit((size / step.sd) ** 2 / 2 - np.log(len(force[i]))))
-            jumps.append(Jump(base.names[i], float(stress), size, step.sd, probability))
-    return tuple(jumps)
+    steps = np.where(np.asarray(design.tests.mask)[..., None], np.tril(np.ones((points, points))), 0.0)
+    alone = replace(design, data=residual, common=design.common[..., :0], group=design.group[:0])
+    particles = LinearModel(now.optimum.hyper, alone.with_amplitudes(steps)).particles
+    return particles.score, np.diagonal(particles.information, axis1=1, axis2=2)

@@ -24,10 +24,7 @@ DRIVE_WAVES = 26  # periods over the range of micrometres, which is the widest a
 
 @compiled_quickly
 def coordinates(point: Point, tests: Tests, forms: Forms, a: Array) -> dict[str, Array]:
-    """Coordinates of every point: reduced strain (1 + a H) epsilon_P, travel in diameters, force, loads, times, sizes.
-
-    Reduced strain is what the law's loading curve is a function of: what it lacks may well be one of that, too.
-    """
+    """Coordinates of every point; `strain` is (1 + a H) epsilon_P, of which the law's loading curve is a function."""
 
     def one(latent: Array, tests: Tests) -> dict[str, Array]:
         law = forms.law(latent, jnp.zeros(0))
@@ -62,10 +59,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms, a: Array) -> dict[str,
 
 
 def informative(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
-    """Coordinates that carry information: time does where most tests unload.
-
-    Of loading alone it is what is measured: a drive that closes at one speed makes it the displacement itself.
-    """
+    """The coordinates without time where few tests unload: there it is the displacement of a drive at one speed."""
     unloads = np.max(np.where(mask, at["unloading"], 0.0), 1)
     return at if np.median(unloads) > 0 else {name: x for name, x in at.items() if name != "clock"}
 
@@ -86,17 +80,16 @@ def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]
 
 
 def functions(names: tuple[str, ...], at: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
-
-    Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so
-    that one scale says how large they are together.
-    """
+    """Smooth products of cosines, and hat functions, over some coordinates, shape (N, points, functions). The squares
+    of either kind add up to about 1 at every point, so that one scale says how large they are together."""
     some = [at[n] for n in names if np.ptp(at[n]) > 0]
     if not some:
         return np.zeros((*next(iter(at.values())).shape, 0))
     powers = (p for p in itertools.product(range(DEGREE + 1), repeat=len(some)) if 0 < sum(p) <= DEGREE)
     smooth = np.stack([np.prod([np.cos(np.pi * k * x) for x, k in zip(some, p, strict=True)], 0) for p in powers], -1)
-    rough = [hats_of(x, HATS) / np.sqrt(len(some)) for x in some]
+    # Piecewise linear, 1 at one of even places.
+    hats = [np.maximum(1 - np.abs(x[..., None] - np.linspace(0, 1, HATS)) * (HATS - 1), 0.0) for x in some]
+    rough = [one / np.sqrt(len(some)) for one in hats]
     return np.concatenate([smooth * np.sqrt(1 / smooth.shape[-1]) * np.sqrt(2), *rough], -1)
 
 
@@ -104,28 +97,17 @@ def misfit_columns(
     variant: Variant, curve: np.ndarray, smooth: np.ndarray, siblings: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """Columns by which a formula may be wrong that adds a curve to the tests: towards its siblings, and smooth ones."""
-    size = float(np.sqrt(np.sum(curve**2)))
-    towards = []
+    size, towards = np.linalg.norm(curve), []
     for formula, column in siblings.items():
-        length = float(np.sqrt(np.sum(column**2)))
-        if formula != variant.name and length > 0:
-            likeness = float(np.sum(column * curve))
-            towards.append((column * np.copysign(size / length, likeness) - curve)[..., None])
+        if formula != variant.name and np.any(column):
+            factor = np.copysign(size / np.linalg.norm(column), np.sum(column * curve))
+            towards.append((column * factor - curve)[..., None])
     return np.concatenate([*towards, curve[..., None] * smooth], -1)
 
 
-def hats_of(x: np.ndarray, count: int) -> np.ndarray:
-    """Hat functions, piecewise linear and 1 at one of `count` even places, of a coordinate between 0 and 1."""
-    centres = np.linspace(0, 1, count)
-    return np.maximum(1 - np.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
-
-
 def splines(x: np.ndarray, count: int) -> np.ndarray:
-    """Cosines of a coordinate between 0 and 1, as a smoothing spline weighs them, with a variance of about 1 together.
-
-    Their standard deviations fall with the square of the frequency (Wahba 1990): smooth curves cost little, and steps
-    of the slope, at onsets and thresholds, are still reached.
-    """
+    """Cosines of a coordinate between 0 and 1, with a variance of about 1 together and as a smoothing spline weighs
+    them: sds fall with the square of the frequency (Wahba 1990)."""
     k = np.arange(1, count + 1)
     weight = k**-2.0 * np.sqrt(2 / np.sum(k**-4.0))
     return weight * np.cos(np.pi * k * x[..., None])
@@ -143,10 +125,8 @@ def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple
     It is a sum of Gaussian processes, each in one coordinate and with a scale of its own, so that coordinates that
     explain nothing cost next to nothing (automatic relevance determination; Duvenaud et al. 2011). All are common to
     all particles and in proportion to their size, but for errors of the instrument, which depend on micrometres and
-    millinewtons alone. In stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a
-    drive loses at a reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has
-    parts of its own. A stress that the loading curve lacks, and a force that the cell gets wrong, move every
-    particle as far as it is soft.
+    millinewtons alone. In stress they are fine: a particle's layers and flaws yield within a narrow range of it. A
+    stress that the loading curve lacks, and a force that the cell gets wrong, move every particle as far as it is soft.
     """
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)[:, None, None]
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
@@ -161,20 +141,12 @@ def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)
     stress = splines(at["strain"], SPLINES) * yielding * size**2
-    cell = by_force * cell_errors(at["force"]) + by_peak * cell_errors(at["peak_force"])
-    parts = [*(part * (size / np.mean(size)) for part in reduced), of_unit(stress, mask), of_unit(cell, mask)]
-    for way in ("unloading", "reloading"):
+    cell = [np.concatenate([splines(at[name], SPLINES), waves(at[name])], -1) for name in ("force", "peak_force")]
+    parts = [part * (size / np.mean(size)) for part in reduced]
+    of_forces = stress, by_force * cell[0] + by_peak * cell[1]  # each with a variance of 1
+    parts += [part / max(float(np.sqrt(np.mean(np.sum(part[mask] ** 2, -1)))), 1e-300) for part in of_forces]
+    for way in ("unloading", "reloading"):  # what a drive loses at a reversal, it loses at once
         turned = at[way][..., None]
         parts.append(np.concatenate([turned, splines(at["since"], HATS) * turned], -1))
     parts.append(waves(at["drive"], DRIVE_WAVES))
     return tuple(np.where(mask[..., None], part, 0.0) for part in parts)
-
-
-def cell_errors(force: np.ndarray) -> np.ndarray:
-    """Smooth and periodic errors of a load cell."""
-    return np.concatenate([splines(force, SPLINES), waves(force)], -1)
-
-
-def of_unit(part: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Functions with a variance of 1 together, over all points that count."""
-    return part / max(float(np.sqrt(np.mean(np.sum(part[mask] ** 2, -1)))), 1e-300)

@@ -12,7 +12,7 @@ from .._errors import InputError
 from .._format import described, table
 from ..calibrate import Model, Posterior
 from ..calibrate.curves import law_of
-from ..calibrate.estimates import estimate, finite
+from ..calibrate.estimates import estimate, finite, normal_estimate
 from ..calibrate.results import DISCOVERY_ARCHIVE, Calibration, Saved
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
@@ -65,18 +65,11 @@ class Effect:
 
     def to_json(self) -> dict[str, Any]:
         """As in `discovery.json`."""
-        half = 1.96 * self.sd
-        own = estimate(self.amplitude, self.sd, (self.amplitude - half, self.amplitude + half))
+        own = normal_estimate(self.amplitude, self.sd)
         fixed = {name: estimate(value) for name, value in self.nuisance.items()}
         unit = self.variant.unit
         jumps = [
-            {
-                "particle": jump.particle,
-                "stress_MPa": jump.stress_MPa,
-                f"size_{unit}": jump.size,
-                f"sd_{unit}": jump.sd,
-                "probability": jump.probability,
-            }
+            {f"{key}_{unit}" if key in ("size", "sd") else key: value for key, value in vars(jump).items()}
             for jump in self.jumps
         ]
         return {
@@ -141,20 +134,14 @@ class Discovery(Saved):
         effects: what was added, in order.
         candidate_set: for each effect, the mechanisms that may be in its place, most probable first.
         pairs: two names each that together may be in place of the one that was added.
-        ranking: all mechanisms against the base law, as in `discovery.json`.
-        untestable: mechanisms these data cannot show, and what they need.
-        where: places of disagreement.
+        ranking, untestable, where, leads, next_experiments: as in `discovery.json`.
         closure: a curve and a formula where no listed mechanism explains the gap.
         held_out: the gap on particles that took no part; None if not asked for.
         p_any: probability of so much evidence of anything if nothing were missing.
         parameters_before, parameters_after: the population's parameters by the law alone and with the effects.
-        next_experiments: further tests that would probably separate the members of a set.
-        seed, runtime_s: for the record.
-        leads: what remains in addition to the names and is not added to the law.
         checks: for every member of a set, what would show it by itself: `mechanism`, `check`.
         posterior: of the law with effects; None where no `Model` holds what was added, or it was not asked for.
-        notes: what a reader must know.
-        findings: what the checks of the tests found, and which particles took no part for it.
+        findings, notes: what a reader must know, of the tests and of the answer.
         residuals: of every test, without and with what was added; None where the base law was not fitted.
         places: the whole map of disagreement.
         likeness: which mechanisms look alike; None where there was nothing to compare.
@@ -217,9 +204,8 @@ class Discovery(Saved):
                 remedy = "Sample it: mcc.sample(campaign, found.model).law(particle)."
                 raise InputError("the law of one particle with effects takes its posterior", remedy=remedy)
             return self.posterior.law(particle)
-        model = self.base.model
-        numbers = {"method": "bayes", "law": {"unloading": model.unloading, "strain_scaling": model.strain_scaling}}
-        law = law_of(numbers | (self.parameters_after or self.parameters_before))
+        form = {"unloading": self.base.model.unloading, "strain_scaling": self.base.model.strain_scaling}
+        law = law_of({"law": form, "method": "bayes"} | (self.parameters_after or self.parameters_before))
         return law.with_effects(*(effect.build() for effect in self.effects))
 
     def gap(self) -> dict[str, Any]:
@@ -244,6 +230,7 @@ class Discovery(Saved):
     @cached_property
     def content(self) -> dict[str, Any]:
         """The contents of `discovery.json`, worked out once."""
+        posterior = self.posterior
         return {
             "schema": 1,
             "verdict": self.verdict,
@@ -259,7 +246,7 @@ class Discovery(Saved):
             "gap": self.gap(),
             "parameters_before": self.parameters_before,
             "parameters_after": self.parameters_after,
-            "posterior": None if self.posterior is None else self._of_posterior(self.posterior),
+            "posterior": posterior and {"converged": posterior.converged} | posterior.diagnostics(),
             "next_experiments": list(self.next_experiments),
             "checks": list(self.checks),
             "p_anything_missing": finite(self.p_any),
@@ -270,17 +257,4 @@ class Discovery(Saved):
             "findings": [one.to_json() for one in self.findings],
             "seed": self.seed,
             "runtime_s": self.runtime_s,
-        }
-
-    @staticmethod
-    def _of_posterior(posterior: Posterior) -> dict[str, Any]:
-        """Whether the posterior of the law with effects may be believed."""
-        return {
-            "converged": posterior.converged,
-            "failures": posterior.failures(),
-            "rhat_max": finite(max(posterior.rhat.values())),
-            "ess_bulk_min": finite(min(posterior.ess_bulk.values())),
-            "divergences": posterior.divergences,
-            "pareto_k_max": finite(float(np.max(posterior.pareto_k))),
-            "pareto_k_joint": finite(posterior.pareto_k_joint),
         }

@@ -116,8 +116,8 @@ def untestable(
 
 
 def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
-    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be:
-    otherwise it would be nothing but another name for the compliance of the frame."""
+    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be: it
+    would be another name for the compliance of the frame."""
     diameter, tests = base.campaign.metadata.punch_diameter_um, base.tests
     ends = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1)
     travel = np.maximum(ends - np.asarray(base.state.point.zero), 0.0)
@@ -150,16 +150,14 @@ def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect,
 def with_signatures(base: Base, state: State, candidates: Sequence[Candidate]) -> Candidates:
     """Candidates with their signatures at the base law."""
     effects = tuple(c.variant.build(0.0, **c.nuisance) for c in candidates)
-    columns = base.each(candidate_columns, state.point, effects, base.forms)
+    columns = base.each(candidate_columns, state.point, effects, base.model.forms)
     return Candidates(tuple(candidates), np.asarray(columns) * [c.variant.plausible[0] for c in candidates])
 
 
 @dataclass(frozen=True)
 class Screen:
-    """Candidates against the base law, all else integrated out, in units of their smallest plausible amplitudes.
-
-    Arrays have an entry for each of the hyperparameters that were tried, those of the base law first.
-    """
+    """Candidates against the base law, all else integrated out, in units of their smallest plausible amplitudes; arrays
+    have an entry for each of the hyperparameters that were tried, those of the base law first."""
 
     candidates: Candidates
     log_null: np.ndarray  # log marginal likelihood without any, times the hyperparameters' prior
@@ -173,8 +171,7 @@ class Screen:
         return np.max(self.log_null[:, None] + each, 0)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Candidates of every two mechanisms, first and second, and log marginal likelihood of both, each at its best
-        setting."""
+        """Candidates of every two mechanisms, first and second, and their log marginal likelihood."""
         a, b = np.triu_indices(len(self.candidates.each), 1)
         two = self.candidates.mechanisms[a] != self.candidates.mechanisms[b]
         a, b, signs, largest = a[two], b[two], self.candidates.signs, self.candidates.largest

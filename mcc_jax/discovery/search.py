@@ -36,22 +36,18 @@ from .settings import CONTENDERS, DECISIONS, STRONG, VERY_STRONG
 FORMULAS, ALL_FORMULAS = 2, 8  # of each contender that are fitted where one is `VERY_STRONG`, and of the leading two
 SECONDS = 3  # second names tried next to each of the two leading ones, and pairs that lead to first order
 
+Library = Mapping[str, Mechanism]
+
 
 class Search:
     """One search: what all hypotheses share, and what was found."""
 
     def __init__(
-        self,
-        base: Base,
-        library: Mapping[str, Mechanism],
-        progress: Progress = lambda _: None,
-        *,
-        whole: Mapping[str, Mechanism] | None = None,
+        self, base: Base, library: Library, progress: Progress = lambda _: None, *, whole: Library | None = None
     ) -> None:
         """Fit the law alone; `library` has what is searched for, `whole` also formulas that the tests cannot show."""
-        self.library, self.progress = library, progress
-        self.base, start = with_likely_noise(base)
-        base = self.base
+        base, start = with_likely_noise(base)
+        self.base, self.library, self.progress = base, library, progress
         places = [base.state]
         if base.coarse:
             places += [at_priors(base, rows) for rows in (base.snaps, np.ones(len(base.tests), bool)) if rows.any()]
@@ -60,14 +56,13 @@ class Search:
         # Hypotheses look for their optimum from the null's state; of a material that the law was not made for from the
         # priors' middle, too, since such tests have several optima.
         self.starts = [self.null.state, *places[1:][-1:]]
-        each = base.each(coordinates, self.null.state.point, base.forms, self.null.state.population[0])
+        each = base.each(coordinates, self.null.state.point, base.model.forms, self.null.state.population[0])
         mask = np.asarray(base.tests.mask)
         self.natural = informative({k: np.asarray(x) for k, x in each.items()}, mask)  # coordinates of all points
         self.at = scaled(self.natural, mask)  # the same between 0 and 1
-        self.shared = {
-            name: m for name, m in library.items() if not m.sudden and not any(v.random_per_test for v in m.variants)
-        }
-        self.not_shared = {m: library[m] for m in library if m not in self.shared}  # numbers differ from test to test
+        differ = {m for m in library if library[m].sudden or any(v.random_per_test for v in library[m].variants)}
+        self.not_shared = {m: library[m] for m in library if m in differ}  # numbers differ from test to test
+        self.shared = {m: library[m] for m in library if m not in differ}
         # Those of the whole library are computed: campaigns that can show different ones share what is compiled.
         self.candidates = with_signatures(base, self.null.state, candidates_of(whole or library)).of(library)
         self.screen = self.screened(self.shared)
@@ -78,7 +73,7 @@ class Search:
         self.untestable: list[dict[str, str]] = []  # mechanisms that these tests cannot show, and what they need
         self.left_out: list[Finding] = []  # which tests took no part, and why
 
-    def screened(self, library: Mapping[str, Mechanism], *, several: bool = True) -> Screen:
+    def screened(self, library: Library, *, several: bool = True) -> Screen:
         """Some mechanisms to first order, around the base law."""
         candidates = self.candidates.of(library)
         return screen(self.base, self.null.state, self.null.optimum.hyper, candidates, several=several)
@@ -87,7 +82,9 @@ class Search:
 
     def log_posteriors(self) -> dict[Names, float]:
         """Log evidence and log prior of every hypothesis that may be named, best first: pairs lead by the margin."""
-        return _that_may_be_named(self._log_joints())
+        logs = self._log_joints()
+        fewer = max(v for names, v in logs.items() if len(names) < 2)
+        return _best_first({n: v for n, v in logs.items() if len(n) < 2 or v > fewer + DECISIONS.margin})
 
     @property
     def is_gap(self) -> bool:
@@ -95,16 +92,12 @@ class Search:
         return self.p_any < DECISIONS.level and self.posterior()[()] < 0.5
 
     def posterior(self) -> dict[Names, float]:
-        """Probability of every hypothesis, most probable first.
-
-        The margin is for second names, which what a first one misses invites. Two names in place of the one that would
-        be named are no such invitation: they count by their prior odds, and make the answer a set.
-        """
-        joints = self._log_joints()
-        logs = _that_may_be_named(joints)
+        """Probability of every hypothesis, most probable first. The margin is for second names, which what a first one
+        misses invites; two names in place of the leader count by their prior odds, and make the answer a set."""
+        logs = self.log_posteriors()
         leader = next(iter(logs))
         if len(leader) == 1 and leader != UNLISTED:
-            logs |= {n: v for n, v in joints.items() if len(n) == 2 and leader[0] not in n}
+            logs |= {n: v for n, v in self._log_joints().items() if len(n) == 2 and leader[0] not in n}
         total = float(np.logaddexp.reduce(list(logs.values())))
         return {names: float(np.exp(v - total)) for names, v in _best_first(logs).items()}
 
@@ -112,10 +105,9 @@ class Search:
         """Log evidence and log prior of every hypothesis; of pairs those with a second name of credible size."""
         count = len(self.library)
         priors = {0: 0.0, 1: -np.log(count), 2: -DECISIONS.pair - np.log(max(count * (count - 1) / 2, 1))}
-        logs = {
-            names: one.log_evidence + (-DECISIONS.unlisted if names == UNLISTED else priors[len(names)])
-            for names, one in self.found.items()
-        }
+        logs = {names: one.log_evidence + priors[len(names)] for names, one in self.found.items()}
+        if UNLISTED in logs:
+            logs[UNLISTED] = self.found[UNLISTED].log_evidence - DECISIONS.unlisted
         for names, one in self.found.items():
             if len(names) == 1 and np.isfinite(one.with_discrepancy):
                 # Two causes, of which one is on no list: they count for the one that explains more by itself.
@@ -125,10 +117,8 @@ class Search:
         return {names: v for names, v in logs.items() if len(names) < 2 or self._credible(names)}
 
     def _credible(self, names: Names) -> bool:
-        """Whether the name of a pair that explains less by itself has an amplitude that one would believe.
-
-        What takes an amplitude beyond its largest plausible one imitates what the first name's formula misses.
-        """
+        """Whether the name of a pair that explains less by itself has an amplitude that one would believe: any larger,
+        it imitates what the first name's formula misses."""
         r = self.found[names].at
         if r is None:
             return True
@@ -142,16 +132,14 @@ class Search:
     def first_order(self) -> dict[str, dict[str, tuple[float, int]]]:
         """Log evidence to first order of every formula of every mechanism, and its best candidate."""
         value = self.screen.singles() - self.screen.log_null.max() + self.null.log_evidence
-        rows: dict[str, dict[str, list[int]]] = {}
+        rows: dict[tuple[str, str], list[int]] = {}
         for k, c in enumerate(self.screen.candidates.each):
-            rows.setdefault(c.mechanism, {}).setdefault(c.variant.name, []).append(k)
-        return {
-            mechanism: {
-                formula: (float(logsumexp(value[ks]) - np.log(len(ks))), ks[int(np.argmax(value[ks]))])
-                for formula, ks in formulas.items()
-            }
-            for mechanism, formulas in rows.items()
-        }
+            rows.setdefault((c.mechanism, c.variant.name), []).append(k)
+        found: dict[str, dict[str, tuple[float, int]]] = {}
+        for (mechanism, formula), ks in rows.items():
+            log_evidence = float(logsumexp(value[ks]) - np.log(len(ks)))
+            found.setdefault(mechanism, {})[formula] = log_evidence, ks[int(np.argmax(value[ks]))]
+        return found
 
     def fit(self, ks: tuple[int, ...]) -> Fitted:
         """Some candidates together at their own optimum, by their formulas."""
@@ -255,11 +243,8 @@ class Search:
         return next(ks for ks, one in self.fits.items() if one is r)
 
     def leading_pairs(self) -> dict[Names, tuple[int, ...]]:
-        """The leading pairs of names to first order around the base law, each by its best candidates.
-
-        Of two strong effects neither need lead by itself: what imitates part of both may. A pair that does not lead
-        every single name by the margin there is left out.
-        """
+        """The leading pairs to first order, each by its best candidates, that lead every single name by the margin: of
+        two strong effects neither need lead by itself."""
         a, b, value = self.screen.pairs()
         least = self.screen.singles().max() + DECISIONS.margin
         found: dict[Names, tuple[int, ...]] = {}
@@ -384,8 +369,7 @@ class Search:
             one.other_noise = float(logsumexp([0.0, *gains.get(names, ())]) - np.log(1 + len(kinds)))
 
     def _gains_by_noise(self, one: Hypothesis, models: Sequence[Model]) -> list[float]:
-        """What a hypothesis in its likelier form gains under other kinds of noise; the best is kept, if it gains, but
-        for the law alone."""
+        """What a hypothesis in its likelier form gains under other kinds of noise; the best one is kept of a name."""
         hyper, design = one.likely_form()
         own = log_joint(hyper, design)
         found = [with_other_noise(design, hyper, model) for model in models]
@@ -398,11 +382,6 @@ class Search:
 def pair_of(one: str, other: str) -> Names:
     """Two names in their order."""
     return (one, other) if one < other else (other, one)
-
-
-def _that_may_be_named(logs: Mapping[Names, float]) -> dict[Names, float]:
-    fewer = max(v for names, v in logs.items() if len(names) < 2)
-    return _best_first({n: v for n, v in logs.items() if len(n) < 2 or v > fewer + DECISIONS.margin})
 
 
 def _best_first(logs: Mapping[Names, float]) -> dict[Names, float]:

@@ -9,45 +9,28 @@ from .._format import described
 
 @dataclass(frozen=True)
 class Decisions:
-    """Prior odds, and the evidence that an answer needs. Logarithms are natural.
+    """Prior odds, and the evidence that an answer needs. Logarithms are natural."""
 
-    Attributes:
-        level: a verdict other than NO_GAP needs a bootstrap p value below it: one false alarm in twenty campaigns.
-        pair: log prior odds of one name against two, over the number of pairs: e^5 = 150; a second study of
-            prototypes was right in 88 of 106 campaigns with it.
-        margin: nats by which two names must lead everything with at most one: one more than the odds, since what a
-            name's misfit leaves invites a second; 91 of the same 106, true pairs led by 12 to 482.
-        unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains; in
-            addition to a name it costs `pair`, too, as any second cause does.
-        set_mass: names are reported, best first, until they hold this posterior probability together.
-        misfit, misfit_log_sd, misfit_most: size of what a mechanism's formulas miss of its effect, median, standard
-            deviation of the logarithm, and the most: 0.03 to 0.3 is what the library's own formulas leave of each
-            other; with a size of 1 every mechanism imitates every other, and strong effects would have it.
-        scatter: scale of the half-normal prior of how much an amplitude differs from particle to particle, as a share
-            of it: toes need 0.1 (`misfit` and this are integrated out together).
-        general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
-        jump: share of the tests in which a sudden step is expected, a priori, and so how much evidence one needs.
-        contradicted: standard errors by which held-out particles must be predicted worse with what was found before it
-            is taken back: beyond two a difference is hardly chance.
-        readings: of a branch that are compared, about, of a material that the law was not made for: what the law
-            misses there is each particle's own over a fifth of a branch, and a few readings in each such piece show it.
-        foreign_misfit: share of the range of displacement that the law must miss for that; with its own data and a
-            instrument's noise it misses less.
-    """
-
+    # A verdict other than NO_GAP needs a bootstrap p value below it: one false alarm in twenty campaigns.
     level: float = 0.05
+    # Log prior odds of one name against two, over the number of pairs: e^5 = 150. With it, and the margin by which two
+    # names must lead (what a name's misfit leaves invites a second), prototypes were right in 88 to 91 of 106 cases.
     pair: float = 5.0
     margin: float = 10.0
-    unlisted: float = 5.0
-    set_mass: float = 0.95
+    unlisted: float = 5.0  # log prior odds of a name against a discrepancy that none explains; together also `pair`
+    set_mass: float = 0.95  # names are reported, best first, until they hold this posterior probability together
+    # Share of its effect that a mechanism's formulas miss, median, sd of the logarithm, and the most: the library's own
+    # leave 0.03 to 0.3 of each other; with a size of 1 every mechanism imitates every other.
     misfit: float = 0.1
     misfit_log_sd: float = 0.8
     misfit_most: float = 0.3
-    scatter: float = 0.1
-    general: float = 3.0
+    scatter: float = 0.1  # scale of how much amplitudes differ between particles, as a share: toes need so much
+    general: float = 3.0  # size of a smooth discrepancy in standard deviations of white noise, and sd of its logarithm
     general_log_sd: float = 1.5
-    jump: float = 0.25
-    contradicted: float = 2.0
+    jump: float = 0.25  # share of the tests in which a sudden step is expected
+    contradicted: float = 2.0  # standard errors by which held-out particles are predicted worse: hardly chance
+    # Of a material that the law was not made for, readings of a branch that are compared: its misfit is smooth over a
+    # fifth of one; and the share of the range of displacement that the law must miss: with its own it misses less.
     readings: int = 24
     foreign_misfit: float = 0.01
 

@@ -92,11 +92,8 @@ class _Statistic:
 
 
 def p_anything(search: Search, seed: int) -> float:
-    """Probability that the base law alone would give as much evidence of anything missing.
-
-    Scores of campaigns of the base law are drawn at its fitted hyperparameters: they are normal, with the information
-    as their covariance.
-    """
+    """Probability that the base law alone would give as much evidence of anything missing, from scores drawn at its
+    fitted hyperparameters: normal, with the information as covariance."""
     statistic = _Statistic(search)
     values, vectors = np.linalg.eigh(statistic.gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
@@ -139,9 +136,9 @@ class HeldOut:
     def objection(self, rms_um: Sequence[np.ndarray], range_um: np.ndarray) -> str | None:
         """Why what was found cannot be the answer, going by held-out particles; None if nothing speaks against it.
 
-        That it does not help enough is no objection: weak effects hardly do. That it harms is one, by the log
-        predictive density against its standard error or by the sign test of the particles' root mean square residuals
-        `rms_um` at every step; and so is a law that with it still misses tests by much of their range.
+        Not that it helps little, as weak effects do, but that it harms, by the log predictive density or by the sign
+        test of root mean square residuals `rms_um` at every step; or that tests are still missed by much of their
+        range.
         """
         from scipy.stats import binomtest
 
@@ -196,9 +193,7 @@ NOT_ASKED: dict[str, Any] = {
 
 def held_out(search: Search, winner: Names) -> HeldOut:
     """Leave out one particle after the other; choose and fit with the others; see how far it is then from the law.
-
-    Every hypothesis stays linear where all particles have put it, at the hyperparameters they have; which one is
-    chosen, and its numbers, are the others' alone."""
+    Every hypothesis stays linear where all particles have put it, at their hyperparameters."""
     null, everyone = search.null.design, np.arange(len(search.base.tests))
     logs = search.log_posteriors()
     contestants: dict[Names, LinearModel] = {}

@@ -23,11 +23,6 @@ def by_particle(paper_posterior):
     return {name: one.to_arviz() for name, one in pair}
 
 
-@pytest.fixture(scope="module")
-def by_reading(paper_posterior):
-    return paper_posterior.to_arviz(points=True)
-
-
 def test_summary(by_particle):
     table = az.summary(by_particle["first"], var_names=POPULATION)
     assert list(table.index) == POPULATION
@@ -44,12 +39,6 @@ def test_particles_left_out(by_particle):
     assert np.isfinite(table["elpd"]).all()
 
 
-def test_readings_left_out(by_reading):
-    found = az.loo(by_reading)
-    assert found.n_data_points == int(np.isfinite(by_reading["observed_data"]["displacement_um"]).sum())
-    assert np.isfinite(found.elpd)
-
-
 def test_sensitivity_to_the_prior(by_particle):
     table = az.psense_summary(by_particle["first"], var_names=POPULATION, likelihood_var_names="test")
     assert list(table.index) == POPULATION
@@ -59,11 +48,6 @@ def test_sensitivity_to_the_prior(by_particle):
 @pytest.mark.parametrize("draw", ["plot_forest", "plot_trace", "plot_dist", "plot_rank", "plot_ess", "plot_pair"])
 def test_pictures_of_parameters(by_particle, draw):
     getattr(az, draw)(by_particle["first"], var_names=POPULATION[:3], backend="matplotlib")
-
-
-@pytest.mark.parametrize("draw", ["plot_ppc_dist", "plot_ppc_pit", "plot_loo_pit"])
-def test_pictures_of_predictions(by_reading, draw):
-    getattr(az, draw)(by_reading, backend="matplotlib")
 
 
 @pytest.fixture(autouse=True)

@@ -19,6 +19,7 @@ from scipy.stats import kstest, lognorm, nakagami, norm
 
 from mcc_jax import InputError, Model, Priors, Programme
 from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
+from mcc_jax.calibrate.draws import coordinates_of
 from mcc_jax.calibrate.forward import Point
 from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, populations, seeded
 from mcc_jax.calibrate.noise import standard_promotion
@@ -214,7 +215,8 @@ def test_the_density_is_priors_times_likelihood_times_volume(target, density):
         free = jnp.asarray(0.7 * rng.standard_normal(len(target.names)))
         jacobian, population, expected = parts(free)
         one = jax.tree.map(lambda x: np.asarray(x)[None], population)
-        sites = population_sites(target.model, np.asarray(target.marginal.flatness), one)
+        known = coordinates_of(one, target.model)
+        sites = population_sites(target.model, np.asarray(target.marginal.flatness), known)
         expected += sum(v[0] for v in sites.log_densities().values())
         expected += np.linalg.slogdet(np.asarray(jacobian))[1]
         np.testing.assert_allclose(float(density(free)[0]), expected, rtol=1e-9)

@@ -105,16 +105,6 @@ def test_numbers_are_those_of_the_draws(result, content):
     assert content["yield_stress_MPa"]["value"] == pytest.approx(expected)
 
 
-@pytest.mark.extended
-def test_another_seed_gives_nearly_the_same_numbers(result):
-    other = sample(paper_campaign(0), seed=1)
-    one, two = result.named_population(), other.named_population()
-    for name in one:
-        assert not np.array_equal(one[name], two[name]), name
-        assert abs(one[name].mean() - two[name].mean()) < 0.15 * one[name].std(), name
-        assert one[name].std() == pytest.approx(two[name].std(), rel=0.2), name
-
-
 def test_probability_not_monotone_is_that_of_draws_from_the_population(result):
     laws = sample_laws(result, 4000, seed=3)
     share = 1 - np.mean(np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws)))

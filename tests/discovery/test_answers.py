@@ -1,6 +1,5 @@
 """What is reported: sentences without private words, formulas that are what they print, shares next to chi2."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -9,8 +8,7 @@ import pytest
 from mcc_jax.discovery.answer import averaged
 from mcc_jax.discovery.closure import LETTERS, terms_of
 from mcc_jax.discovery.result import Discovery, Effect
-from mcc_jax.discovery.sentences import summary_of, taken_back
-from mcc_jax.discovery.settings import DECISIONS, Decisions
+from mcc_jax.discovery.sentences import summary_of
 from mcc_jax.discovery.verify import HeldOut
 from mcc_jax.effects import find_variant
 
@@ -75,14 +73,6 @@ def test_a_weak_effect_that_hardly_helps_is_not_contradicted():
     assert held(elpd=rng.normal(0, 1, (2, 20))).objection([np.ones(20), after], np.full(20, 100.0)) is None
 
 
-@pytest.mark.parametrize(("names", "words"), [(("pop_in", "creep"), "pop in and creep"), ((), "formula of its own")])
-def test_what_is_taken_back_is_said(names, words):
-    text = taken_back(names, "8 of 8 lie further from the law")
-    assert words in text
-    assert "8 of 8" in text
-    assert "_" not in text
-
-
 def summary(verdict, amplitude=1e-4, **more):
     effect = Effect(find_variant("platen_sink_in"), {}, amplitude, 0.001, 0.97, 0.002, misfit=0.4)
     named = verdict in ("NAMED", "SET")
@@ -118,8 +108,3 @@ def test_a_summary_says_what_limits_the_answer():
     assert "more than is plausible" not in summary("NAMED", 0.9 * most)
     assert "named, not closed" in summary("NAMED", held_out=held(9.0, 2.0))
     assert "named, not closed" not in summary("NAMED", held_out=held(9.0, 1.0))
-
-
-def test_few_numbers_decide():
-    assert len(dataclasses.fields(Decisions)) <= 17
-    assert Decisions() == DECISIONS

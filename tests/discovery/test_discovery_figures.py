@@ -60,9 +60,7 @@ def test_what_is_left_is_less_with_the_effect_and_the_same_without(found):
 def test_map_and_likeness_are_complete(found):
     places = found["frame"].places
     assert {place.segment for place in places} == {"loading", "hold", "unloading", "reloading"}
-    assert sum(place.segment == "hold" for place in places) == 1
     assert np.nansum([place.share for place in places]) == pytest.approx(1)
-    assert {place.sign for place in places} <= {-1, 0, 1}
     names, both = found["frame"].likeness.names, found["frame"].likeness.correlation
     shared = {e["mechanism"] for e in found["frame"].ranking} - {"thermal_drift", "pop_in"}
     assert set(names) == shared  # what differs from test to test is like nothing that all share

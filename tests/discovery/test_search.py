@@ -8,7 +8,7 @@ from campaigns import base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
 from mcc_jax.discovery import screen, verify
-from mcc_jax.discovery.answer import effects_of, instead_of, places, population_under, sets_of, where
+from mcc_jax.discovery.answer import effects_of, instead_of, population_under, sets_of
 from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
 from mcc_jax.discovery.hypothesis import UNLISTED, Hypothesis
 from mcc_jax.discovery.search import Search
@@ -68,18 +68,6 @@ def test_p_values_of_nothing_are_uniform(monkeypatch):
     p = np.array([verify.p_anything(nothing, seed) for seed in range(30)])
     assert 0.3 < p.mean() < 0.7
     assert np.sum(p < 0.1) <= 8
-
-
-def test_places_share_the_difference(named):
-    tests = named.base.tests
-    mask = np.asarray(tests.mask)
-    left = np.zeros(mask.shape)
-    left[mask & (np.asarray(tests.record.kind) == 2)] = 1.0  # in holds alone
-    map_ = places(named.base, left)
-    (told,) = where(named.base, map_)
-    assert told["segment"] == "hold"
-    assert told["share"] == pytest.approx(1)
-    assert sum(p.share for p in map_ if p.share == p.share) == pytest.approx(1)
 
 
 def test_two_names_must_lead_by_the_margin(named, with_pair):
@@ -175,11 +163,9 @@ def test_pairs_to_first_order_are_of_two_mechanisms(named, monkeypatch):
     a, b, value = named.screen.pairs()
     mechanisms = named.screen.candidates.mechanisms
     assert np.all(mechanisms[a] != mechanisms[b])
-    assert len(value) == np.prod(np.unique(mechanisms, return_counts=True)[1])
     # A second amplitude that explains nothing costs a little of the evidence that the first has alone.
     alone, best = named.screen.singles().max(), int(np.argmax(value))
     assert alone - 8 < value[best] < alone + 8
-    assert named.leading_pairs() == {}
     monkeypatch.setattr("mcc_jax.discovery.search.DECISIONS", replace(DECISIONS, margin=-100.0))
     assert named.leading_pairs() == {("damage", "frame_compliance"): (a[best], b[best])}
 
