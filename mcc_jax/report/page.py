@@ -11,6 +11,7 @@ from typing import Any
 from .._extras import extra
 from .._format import interval, listed, number, percent, plain, probability, with_sd
 from .._types import Progress
+from .._version import __version__
 from ..calibrate.curves import KINDS, FittedCurve
 from ..calibrate.estimates import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
