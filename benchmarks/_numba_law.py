@@ -9,7 +9,7 @@ import math
 import numba
 import numpy as np
 
-from mcc_jax.formulas.recovery import RATIO_64
+from mcc_jax.formulas.contact import RATIO_64
 
 _RATIO = np.array(RATIO_64)
 _CONSTANT = 4.12

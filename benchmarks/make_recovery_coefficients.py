@@ -1,4 +1,4 @@
-"""Print the coefficients in `mcc_jax/formulas/recovery.py`.
+"""Print the coefficients in `mcc_jax/formulas/contact.py`.
 
 Run `uv run --group test python benchmarks/make_recovery_coefficients.py`.
 

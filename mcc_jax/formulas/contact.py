@@ -1,14 +1,15 @@
-r"""The law of one contact, four numbers and the largest displacement so far, in any consistent units.
+r"""The law of one contact: four numbers and the largest displacement so far, in any consistent units.
 
 .. math::
     F &= k_1 \gamma - k_3 \gamma^3 + k_5 \gamma^5 && \text{loading}, \quad \gamma \ge \gamma_P \\
     F &= F_P\, f(s), \quad s = (\gamma_P - \gamma) / \Delta && \text{unloading and reloading} \\
+    f(s) &= \tfrac{2}{\pi} \left[\arccos s - s \sqrt{1 - s^2}\right] \\
     \Delta^2 &= c\, (F_P / \gamma_P)^n\, \gamma_P^{n-1} && \text{recovered on full release},
         \quad \Delta \le \min\left(\gamma_P,\ \tfrac{3\pi}{8}\, F_P \Big/ \frac{dF}{d\gamma}\Big|_P\right)
 
-with f of `stress_ratio`. Without the limit a release could give back more than loading took, at small peaks by the
-printed form, with a soft modulus by every form. With it no cycle of any path gains energy; the proof is in the
-documentation, "The law". In a pair each side has its own limit; the sides carry one force, so energies add.
+Without the limit a release could give back more than loading took, at small peaks by the printed form, with a soft
+modulus by every form. With it no cycle of any path gains energy; the proof is in the documentation, "The law". In a
+pair each side has its own limit; the sides carry one force, so energies add.
 """
 
 from __future__ import annotations
@@ -22,23 +23,146 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._numerics import recompute, running_max
-from .._types import Path, Scalar, Values
-from .loading import Quintic, reached
-from .recovery import energy_ratio, recovery, stress_ratio
+from .._numerics import horner, recompute, rough_power, running_max, two_thirds_power
+from .._types import Flag, Path, Scalar, Values
 
 SHARE = 3 * math.pi / 8
 r"""Largest :math:`\Delta F'/F_P`. Elastic energy is :math:`\tfrac{4}{3\pi} F_P \Delta`; with it :math:`F^2/(2F')`."""
 PEAKS = 256
-"""Peaks, evenly spread, at which `first_gain` asks whether more is lost than at the one before."""
+"""Peaks, evenly spread, at which `first_gain` compares what is lost with the peak before."""
+HALLEY_STEPS = 4
+"""Meet the last digit in every case tried: k3 = 0, loss of monotonicity, peaks approached to 1e-14, 13 decades."""
 
 Flags = Bool[Array, "..."]
 
 
-class Recovered(NamedTuple):
-    """What full release from a peak gives back, as a quotient top / bottom; 1 where no force was carried.
+# ---- loading ---------------------------------------------------------------------------------------------------------
 
-    Whether the peak carries force, and whether the limit holds, and there the second of its two terms.
+
+class Quintic(eqx.Module):
+    """:math:`k_1 x - k_3 x^3 + k_5 x^5`, force against displacement or stress against scaled strain.
+
+    Never below zero: pushing a particle together cannot pull. The bare quintic would where k3^2 > 4 k1 k5.
+    """
+
+    k1: Values
+    k3: Values
+    k5: Values
+
+    def secant(self, x: Values) -> Values:
+        """Value over x, as a polynomial: finite at x = 0, where their quotient is not."""
+        square = x * x
+        value = self.k1 - square * (self.k3 - square * self.k5)
+        return jnp.where(value < 0, 0.0, value)  # this way round a parameter that is NaN shows
+
+    def tangent(self, x: Values) -> Values:
+        """Slope of the bare quintic."""
+        square = x * x
+        return self.k1 - square * (3 * self.k3 - 5 * square * self.k5)
+
+    def loading(self, x: Values) -> Values:
+        """Force or stress of loading."""
+        return x * self.secant(x)
+
+    def work(self, x: Values) -> Values:
+        """Integral of loading. The stretch that is cut off ends at roots: derivatives do not depend on its ends."""
+
+        def integral(square: Values) -> Values:
+            return square * (self.k1 / 2 - square * (self.k3 / 4 - square * self.k5 / 6))
+
+        square = x * x
+        discriminant = self.k3 * self.k3 - 4 * self.k1 * self.k5
+        pulls = discriminant > 0
+        larger = jnp.where(pulls, self.k3 + jnp.sqrt(jnp.where(pulls, discriminant, 1.0)), 1.0)
+        begin, end = jax.lax.stop_gradient((2 * self.k1 / larger, larger / jnp.where(pulls, 2 * self.k5, 1.0)))
+        before = integral(jnp.where(pulls & (square > begin), begin, square))
+        return before + jnp.where(pulls & (square > end), integral(square) - integral(end), 0.0)
+
+    @property
+    def is_monotone(self) -> Flag:
+        r"""Whether loading never falls: :math:`9 k_3^2 \le 20 k_1 k_5`. It does in 2.4 % of the paper's draws."""
+        return 9 * self.k3 * self.k3 <= 20 * self.k1 * self.k5
+
+    def halley(self, x: Values) -> tuple[Values, Values, Values]:
+        """Value, slope and half the curvature of the bare quintic: what a step of Halley's method takes."""
+        square = x * x
+        hardening = square * self.k5
+        value = x * (self.k1 - square * (self.k3 - hardening))
+        return value, self.k1 - square * (3 * self.k3 - 5 * hardening), x * (10 * hardening - 3 * self.k3)
+
+
+# ---- the elastic branch in one variable ------------------------------------------------------------------------------
+
+# With s, linear in strain, instead of the paper's phi = sqrt(1 - s^2), which loses all digits near both ends and has no
+# derivative at the onset, every function is an exact power of the distance to the singular end times a polynomial.
+# Accuracy: 4e-16 of the peak in float64, 2e-7 in float32.
+
+
+@jax.custom_jvp
+def stress_ratio(s: Values | float) -> Values:
+    r"""Stress over peak stress :math:`f(s)` [-] after a share s of the strain is recovered: 1 for s <= 0, 0 for s >= 1.
+
+    Derivative :math:`-\tfrac{4}{\pi}\sqrt{1 - s^2}` on 0 <= s < 1, else 0. Bommireddy et al. (2018), eq. 23, with
+    phi^2 = 1 - s^2.
+    """
+    u = jnp.clip(1 - s, 0, 1)
+    return u * recompute(jnp.sqrt(u)) * horner(RATIO_64 if u.dtype == jnp.float64 else RATIO_32, 2 * u - 1)
+
+
+@stress_ratio.defjvp
+def _stress_ratio_jvp(primals, tangents):
+    (s,), (ds,) = primals, tangents
+    inside = (s >= 0) & (s < 1)
+    chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
+    return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * recompute(jnp.sqrt(chord)), 0.0) * ds
+
+
+@jax.custom_jvp
+@jax.jit  # traced once for all its users
+def recovery(ratio: Values | float) -> Values:
+    r"""Inverse of `stress_ratio`: the recovered share of strain [-] at a share of the peak stress.
+
+    Solves Kepler's equation of eccentricity 1, :math:`E - \sin E = \pi\,\sigma/\sigma_P` with :math:`s = \cos(E/2)`, in
+    closed form: 1 for ratio <= 0, 0 for ratio >= 1. The derivative grows as ratio^(-1/3) towards full release and is 0
+    beyond it.
+    """
+    r = jnp.clip(ratio, 0, 1)
+    w = two_thirds_power(r)
+    rest = recompute((1 - r) * (1 + r) / (1 + w * (1 + w)))  # 1 - w, all digits kept towards the peak
+    return jnp.clip(rest * horner(RECOVERY_64 if w.dtype == jnp.float64 else RECOVERY_32, 2 * w - 1), 0, 1)
+
+
+@recovery.defjvp
+def _recovery_jvp(primals, tangents):
+    (ratio,), (dratio,) = primals, tangents
+    s = recovery(ratio)
+    inside = (ratio > 0) & (ratio <= 1) & (s < 1)
+    chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
+    return s, jnp.where(inside, recompute(-jnp.pi / 4 / jnp.sqrt(chord)), 0.0) * dratio
+
+
+@jax.custom_jvp
+def energy_ratio(s: Values | float) -> Values:
+    r"""Elastic energy [-] still stored at a recovered share s, over :math:`\sigma_P \delta`: 4/(3 pi) at the onset.
+
+    .. math:: g(s) = \int_s^1 f = \tfrac{2}{\pi}\left[\sqrt{1 - s^2} - s\arccos s - \tfrac13 (1 - s^2)^{3/2}\right]
+    """
+    u = jnp.clip(1 - s, 0, 1)
+    return u * u * jnp.sqrt(u) * horner(ENERGY_64, 2 * u - 1)
+
+
+@energy_ratio.defjvp
+def _energy_ratio_jvp(primals, tangents):
+    (s,), (ds,) = primals, tangents
+    return energy_ratio(s), jnp.where((s >= 0) & (s < 1), -stress_ratio(s), 0.0) * ds
+
+
+# ---- a contact -------------------------------------------------------------------------------------------------------
+
+
+class Recovered(NamedTuple):
+    """What full release from a peak gives back, as a quotient; whether the peak carries force, whether the limit holds,
+    and there the second of its two terms (`steep`).
     """
 
     top: Values
@@ -49,12 +173,12 @@ class Recovered(NamedTuple):
 
     @property
     def span(self) -> Values:
-        """The recovered displacement."""
+        """The recovered displacement; 1 where no force was carried."""
         return recompute(self.top / self.bottom)
 
     @property
     def displacement(self) -> Values:
-        """The same, 0 where no force was carried."""
+        """The recovered displacement; 0 where no force was carried."""
         return jnp.where(self.carries, self.span, 0.0)
 
 
@@ -70,11 +194,9 @@ class Contact(Quintic):
     c: Values
     power: int = eqx.field(static=True, default=1, kw_only=True)
 
-    # ---- the law: a step, a path, and the same under load control ------------------------------------------------
-
     def step(self, peak: Scalar, displacement: Scalar) -> tuple[Scalar, Scalar]:
         """Largest displacement so far and force after one more displacement."""
-        # Asked this way round, a displacement that is NaN shows; so it is below.
+        # This way round a displacement that is NaN shows; so it is below.
         peak = jnp.where(displacement < peak, peak, displacement)
         return peak, self.force(peak, peak - displacement)
 
@@ -86,8 +208,8 @@ class Contact(Quintic):
 
     def under(self, displacement_max: Scalar, force: Values, highest: Values) -> tuple[Values, Values]:
         """Largest displacement so far and displacement under forces, one or many, each with the highest up to it."""
-        # The barriers make stages that share nothing but what they are given. Where they share intermediate values, XLA
-        # stores those and cuts the loop over the data of the inverse in many pieces.
+        # The barriers make stages that share no intermediate values, which XLA would store, cutting the loop over the
+        # data of the inverse into many pieces.
         contact = jax.lax.optimization_barrier(self)
         past = jax.lax.optimization_barrier(contact.loading(displacement_max))
 
@@ -105,8 +227,6 @@ class Contact(Quintic):
         ratio = recompute(jnp.where(carries, force, 0.0) / jnp.where(carries, peak_force, 1.0))
         released = recovered.span * recovery(ratio)
         return peak, peak - jnp.where(carries & (force < peak_force), released, 0.0)
-
-    # ---- unloading -----------------------------------------------------------------------------------------------
 
     def softened(self, factor: Values | Scalar) -> Contact:
         """The bare contact with a factor on its effective modulus."""
@@ -186,9 +306,9 @@ def stored(force: Values, span: Values, drop: Values) -> tuple[Values, Values]:
 def first_gain(at_peak: Callable[[Scalar], Contact], highest: Scalar) -> Scalar:
     """Smallest peak displacement beyond which further loading gains energy; infinite where it never does.
 
-    What is lost, the work of loading less what full release gives back, depends on the peak alone. Where it falls (by
-    more than rounding) from one peak to the next, a contact that is released, loaded further and released again has
-    gained. NaN counts as a gain. `at_peak` is the contact that unloads from a peak displacement.
+    What is lost, the work of loading less what full release gives back, depends on the peak alone. A contact gains
+    where it falls (by more than rounding) from one peak to the next, or is NaN. `at_peak` is the contact that unloads
+    from a peak displacement.
     """
     peaks = highest * jnp.linspace(0.0, 1.0, PEAKS + 1, dtype=highest.dtype)
 
@@ -199,9 +319,6 @@ def first_gain(at_peak: Callable[[Scalar], Contact], highest: Scalar) -> Scalar:
     work, given_back = jax.vmap(balance)(peaks)
     holds = jnp.diff(work - given_back) >= -8 * jnp.finfo(work.dtype).eps * work[-1]
     return jax.lax.stop_gradient(jnp.where(jnp.all(holds), jnp.inf, peaks[jnp.argmin(holds)]))
-
-
-# ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
 @jax.custom_jvp
@@ -247,3 +364,140 @@ def _branch(contact: Contact, peak: Values, drop: Values) -> tuple[Values, Recov
     per_span = recompute(recovered.bottom / recovered.top)
     s = jnp.where(recovered.carries, drop * per_span, 1.0)
     return contact.loading(peak), recovered, per_span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s))
+
+
+# ---- the inverse of loading ------------------------------------------------------------------------------------------
+
+# Halley's method needs a good start where the curve is nearly flat: at its bend when monotonicity is about to be lost,
+# and at its peak when it is lost. Around the bend b the quintic is exactly
+#   F(b + d) = F_b + m d + 2 k3 d^3 + 5 k5 b d^4 + k5 d^5,
+# so the root of its cubic part is such a start, and an upper bound to the right of the bend. Around a peak p the curve
+# falls by H0 e^2 + H1 e^3 + ..., e = p - x, again a cubic.
+
+
+@jax.custom_jvp
+def reached(curve: Quintic, stress: Values, floor: Scalar) -> Values:
+    """Smallest x at which loading reaches a stress, 0 for stress <= 0; derivatives by the implicit-function rule.
+
+    `floor` is the largest x so far: behind the peak of a curve that falls there is no way back.
+    """
+    target = jnp.maximum(stress, 0.0)
+    # The barrier makes two loops over the data, which on a CPU take four fifths of the time of a single one.
+    x = jax.lax.optimization_barrier(_start(curve, target, floor))
+    # The slope vanishes only where the curve just stops being monotone, and there at the root itself: stay there. Stay,
+    # too, once the stress is met but for rounding, which over a small slope would be a large step.
+    noise = 8 * jnp.finfo(x.dtype).eps * curve.k1
+    rounding = 2 * jnp.finfo(x.dtype).eps * target
+    for _ in range(HALLEY_STEPS):
+        stress_there, slope, half_curvature = curve.halley(x)
+        excess = stress_there - target
+        squared = slope * slope
+        divisor = jnp.maximum(squared - excess * half_curvature, 0.5 * squared)
+        moves = (slope > noise) & (jnp.abs(excess) > rounding)
+        x = x - recompute(excess * slope / jnp.where(moves, divisor, jnp.inf))
+    return x
+
+
+@reached.defjvp
+def _reached_jvp(primals, tangents):
+    curve, stress, _ = primals
+    change, dstress, _ = tangents
+    x = reached(*primals)
+    cube = x * x * x
+    slope = curve.tangent(x)
+    # At the peak of a curve that is not monotone the derivative is infinite; a floor keeps it finite.
+    smallest = jnp.sqrt(jnp.finfo(x.dtype).eps) * curve.k1
+    total = dstress - x * change.k1 + cube * change.k3 - x * x * cube * change.k5
+    return x, jnp.where(stress >= 0, recompute(total / jnp.where(slope > smallest, slope, smallest)), 0.0)
+
+
+def _root(x: Values) -> Values:
+    """Square root of the positive part, for code that is never differentiated."""
+    return recompute(jnp.sqrt(jnp.maximum(x, 0.0)))
+
+
+def _rough(x: Values, p: float) -> Values:
+    """A power within 5 %, of numbers kept within what float32 can hold."""
+    return rough_power(jnp.clip(x, 1e-37, 1e37), p)
+
+
+def _start(curve: Quintic, target: Values, floor: Scalar) -> Values:
+    K1, K3, K5 = curve.k1, curve.k3, curve.k5
+    # Written with maxima, and with each costly value used in few places: it then compiles to few loops over the data.
+    tiny = jnp.finfo(target.dtype).tiny ** 0.5
+    discriminant = 9 * K3 * K3 - 20 * K1 * K5
+    falls = discriminant > 0
+    # Square of the scaled strain at the peak, the smaller root of the slope, without cancellation and division by K5.
+    y = recompute(2 * K1 / (3 * K3 + _root(discriminant) + tiny))
+    peak = _root(y)
+    drop = peak * (K1 - y * (K3 - y * K5)) - target
+    first_branch = falls & (drop >= 0) & (floor <= peak)
+
+    # Below a peak, H0 e^2 + H1 e^3 = drop: e = E g(H1 E / H0) with E = sqrt(drop / H0) and g(z) = (1 + 3z/2)^(-1/3),
+    # right at both ends and 13 % off at worst between them.
+    over_H0 = recompute(1 / jnp.maximum(peak * (3 * K3 - 10 * K5 * y), tiny))
+    E = _root(drop * over_H0)
+    widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E * over_H0
+
+    # Around the bend, d^3 + 3 p d = 2 q. With K3 -> 0 there is no bend; the cubic then replaces K5 x^5.
+    over_K5 = recompute(1 / jnp.maximum(K5, tiny))
+    bend_squared = 0.3 * K3 * over_K5
+    bend = _root(bend_squared)
+    factor = recompute(1 / jnp.maximum(2 * K3, _rough(K1 * K5, 0.5)))
+    p = (K1 - 1.5 * bend_squared * K3) * factor * (1 / 3)
+    secant = K1 - 0.7 * bend_squared * K3
+    q = (target - bend * secant) * factor * 0.5
+    concave = (q < 0) & ~falls
+    half = jnp.abs(q)
+    # One cube root for both; that of a start need not be exact.
+    root_cubed = jnp.where(first_branch, widening, half + _root(half * half + p * p * p))
+    root = jnp.maximum(_rough(root_cubed, 1 / 3), jnp.where(first_branch, 1.0, _root(-p)))
+    over_root = recompute(1 / root)
+    around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p * over_root)
+
+    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. Where K1 x is
+    # more than K5 x^5 the place where they are equal will do.
+    quotient = K1 * over_K5
+    bound = 1.05 * _rough(jnp.maximum(2.25 * target * over_K5, quotient * _rough(quotient, 0.25)), 0.2)
+    bound = jnp.maximum(bound, jnp.where(falls, 2.6, 0.0) * bend)
+    bound = jnp.where(concave, target / secant, bound)  # left of the bend, the chord
+    x = jnp.where(first_branch, peak - E * over_root, jnp.minimum(around_bend, bound))
+    # At or left of the root of a concave piece.
+    return jnp.maximum(x, jnp.where((q < 0) | first_branch, target / K1, 0.0))
+
+
+# ---- polynomials of the branch, from the highest power down; printed by `benchmarks/make_recovery_coefficients.py` ---
+
+# fmt: off
+RATIO_64 = (  # degree 17, largest relative error 9.8e-18
+    -3.1112491627037324e-12, -1.0778152191898491e-11, -2.3673219699814047e-11, -8.452689239590027e-11,
+    -3.319421170673405e-10, -1.212942982787599e-09, -4.4814427848648566e-09, -1.7003372928575843e-08,
+    -6.612178244595573e-08, -2.649041501718955e-07, -1.1023540242429571e-06, -4.820198795141472e-06,
+    -2.254626055400008e-05, -0.00011623474094004388, -0.000698837433216929, -0.005589066336873583,
+    -0.09948832042832373, 1.1059212819304507,
+)
+RATIO_32 = (  # degree 7, largest relative error 3.2e-9
+    -1.2480960895296546e-06, -5.401048983674062e-06, -2.2452455776047703e-05, -0.00011586145470259827,
+    -0.000698856413808037, -0.005589141822871462, -0.0994883198339057, 1.1059212842941968,
+)
+ENERGY_64 = (  # degree 17, largest relative error 8.4e-19
+    -1.2239264552240398e-13, -4.4775614368770457e-13, -1.1073099259581753e-12, -4.2101557246143604e-12,
+    -1.7312782661902265e-11, -6.796752849276065e-11, -2.718377691137876e-10, -1.121199897586585e-09,
+    -4.774596592639362e-09, -2.1136379601434695e-08, -9.823826421390291e-08, -4.86180133022437e-07,
+    -2.6172239575116677e-06, -1.5869018635618415e-05, -0.00011552024703257536, -0.001165001243505945,
+    -0.027759519411803355, 0.4534723205369016,
+)
+RECOVERY_64 = (  # degree 23, largest relative error 1.3e-17
+    1.684851935524473e-10, 3.902923299587117e-10, -1.0449113448846025e-10, -2.3081087011875581e-10,
+    2.146188540744108e-09, 5.038533760882086e-09, 7.874134110883696e-09, 1.884467339936365e-08,
+    4.918527595833039e-08, 1.187491893488825e-07, 2.863356700467264e-07, 7.023157910261354e-07,
+    1.740154861392644e-06, 4.357528422504284e-06, 1.1058300851757174e-05, 2.852318981764797e-05,
+    7.506797103188011e-05, 0.00020270626531019277, 0.0005662800841837647, 0.0016583781234766374,
+    0.00521071202287205, 0.01841721236162996, 0.08318341840902267, 1.0687365999717602,
+)
+RECOVERY_32 = (  # degree 9, largest relative error 1.9e-8
+    1.6910062929247536e-05, 4.308438627404585e-05, 6.947846935028573e-05, 0.0001888210178514567,
+    0.000568356038508883, 0.0016635313387641567, 0.005210447896423434, 0.018416556927822268,
+    0.08318342370927062, 1.0687366131235896,
+)
+# fmt: on

@@ -18,9 +18,7 @@ from .._numerics import compiled_whole, cotangent_barrier, recompute
 from .._types import Flag, Scalar, ScalarLike, Values, scalar
 from ..arguments import finite, member, positive
 from ..geometry import Particle, plastic_shape_factor
-from .contact import Contact
-from .loading import Quintic, reached
-from .recovery import stress_ratio
+from .contact import Contact, Quintic, reached, stress_ratio
 
 AnyShape = Float[Array, "..."]
 
@@ -50,8 +48,7 @@ class Plastic(eqx.Module):
         C3: coefficient of the softening term [-], >= 0.
         C5: coefficient of the hardening term [-], > 0.
 
-    Raises:
-        InputError: for a plain number out of its range; computed ones are judged by `MccLaw.is_valid`.
+    `InputError` for a plain number out of its range; computed ones are judged by `MccLaw.is_valid`.
 
     References:
         Bommireddy et al. (2018), eq. 16, where they are C1, C2, C3 in MPa, MPa^-3, MPa^-5.
@@ -85,8 +82,7 @@ class Plastic(eqx.Module):
     def is_monotone(self) -> Flag:
         r"""Whether stress never falls while strain grows: :math:`9 C_3^6 \le 20 C_1 C_5^5`.
 
-        Beyond equality the curve has a peak and a trough: under load control the particle snaps through to the rising
-        branch, and force as a function of displacement has no derivative with respect to load at the peak.
+        Else the curve has a peak and a trough: under load control the particle snaps through to the rising branch.
         """
         return self.curve.is_monotone
 
@@ -171,7 +167,7 @@ def _shape(value: ScalarLike) -> Scalar:
 
 
 class Formulas(eqx.Module):
-    """The law's parameters, which effects may change, and its closed formulas. Attributes are those of `MccLaw`."""
+    """The law's parameters, which effects may change, and its closed formulas; attributes as of `MccLaw`."""
 
     plastic: Plastic
     a: Scalar = eqx.field(converter=_shape)

@@ -20,7 +20,7 @@ from .._types import Path, Scalar, Values
 from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Factors, Record, Variant, find_variant
 from ..effects.record import first_point
 from ..formulas import Formulas, Quintic, recovery
-from ..formulas.loading import reached
+from ..formulas.contact import reached
 from ..geometry import Particle
 
 Effects = tuple[AbstractEffect, ...]
