@@ -153,7 +153,7 @@ def compaction(count, target, rows=20, steps=100):
     rate = count * rows * steps / (time.perf_counter() - begin)
     row = {
         "particles": count,
-        "edges": int(state.edges.wanted),
+        "edges": int(state.edges.active.sum()),
         "steps": rows * steps,
         "lists made": int(found.lists[-1]),
         "million particle-steps/s": rate / 1e6,

@@ -53,7 +53,6 @@ from .uncertainty import Band as Band
 from .uncertainty import CompactionFit as CompactionFit
 from .uncertainty import PopulationPacking as PopulationPacking
 from .uncertainty import Sensitivity as Sensitivity
-from .uncertainty import band_by_draws as band_by_draws
 from .uncertainty import first_order_band as first_order_band
 from .uncertainty import fit_compaction as fit_compaction
 from .uncertainty import population_packing as population_packing

@@ -27,9 +27,8 @@ def edges_from_jaxmd(neighbours: Any, capacity: int | None = None) -> Edges:
     Raises:
         InputError: if the list is dense, or if it overflowed and so pairs are missing.
     """
-    index = np.asarray(neighbours.idx)
-    count = len(neighbours.reference_position)
-    if index.ndim != 2 or len(index) != 2 or "Sparse" not in str(neighbours.format):
+    index, count = np.asarray(neighbours.idx), len(neighbours.reference_position)
+    if "Sparse" not in str(neighbours.format):
         raise InputError(
             f"a neighbour list of format {neighbours.format}",
             remedy="Make it with `format=jax_md.partition.NeighborListFormat.OrderedSparse`.",
@@ -63,7 +62,7 @@ def jaxdem_force_model(sides: HalfContact) -> Any:
     class MccForce(ForceModel):
         """Loading and unloading of microcrystalline cellulose, one half contact a particle."""
 
-        sides: HalfContact | None = None
+        sides: Any = None  # JaxDEM rebuilds force models by their fields, which must have defaults
 
         @property
         def requires_history(self) -> bool:
@@ -72,7 +71,7 @@ def jaxdem_force_model(sides: HalfContact) -> Any:
 
         def init_history(self, shape: tuple[int, ...]) -> Array:
             """Virgin contacts."""
-            return jnp.zeros(shape, _require(self.sides).k1.dtype)
+            return jnp.zeros(shape, self.sides.k1.dtype)
 
         @staticmethod
         def force_and_history(i: Any, j: Any, pos: Array, state: Any, system: Any, history: Array) -> tuple:
@@ -105,7 +104,7 @@ def _geometry(
     between = system.domain.displacement(pos[i], pos[j], system)
     reach = state.rad[i] + state.rad[j]
     overlap, away = _each(overlap_and_normal, jnp.zeros_like(between), between, reach, i != j, axes=i.ndim)
-    sides = _require(system.force_model.sides)
+    sides = system.force_model.sides
     return overlap, away, (sides_of(sides, jnp.minimum(i, j)), sides_of(sides, jnp.maximum(i, j)))
 
 
@@ -114,10 +113,3 @@ def _each(law: Any, *given: Any, axes: int) -> Any:
     for _ in range(axes):
         law = jax.vmap(law)
     return law(*given)
-
-
-def _require(sides: HalfContact | None) -> HalfContact:
-    """JaxDEM rebuilds force models by their fields, which must have defaults."""
-    if sides is None:
-        raise InputError("a force model without half contacts", remedy="Make it with `jaxdem_force_model(sides)`.")
-    return sides

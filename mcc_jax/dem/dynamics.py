@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,9 @@ from .sharded import Contacts, Devices, gathered, sharded
 from .state import Packing, State, check_state, measured, rebuild_list
 from .walls import Walls, set_velocity
 
-Keep = Literal["steps", "lists"]
-
 
 class Segment(NamedTuple):
-    """A list of edges and for how many steps it was used: what `replay` needs."""
+    """A list of edges and the number of steps on it, for `replay`."""
 
     key: Int[Array, " edges"]
     i: Int[Array, " edges"]
@@ -37,10 +35,10 @@ class Segment(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What was measured at the end of every chunk of steps, with one more axis in front.
+    """What was measured at the end of every row of steps, with one more axis in front.
 
     Attributes:
-        on_wall: force on each wall [N], mean over the chunk's steps.
+        on_wall: force on each wall [N], mean over the steps of the row.
         contacts: pairs and walls that carry force.
         beyond_tested: contacts compressed further than the paper's tests (eta_p eps > 0.67), on either side.
         kinetic: kinetic energy [J].
@@ -60,9 +58,9 @@ class Trajectory(NamedTuple):
 
 
 def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = contact_forces) -> tuple[State, Forces]:
-    """One step of the symplectic Euler rule (leapfrog): forces, then velocities, then positions and walls.
+    """One step of the symplectic Euler rule (leapfrog): forces by `contacts`, velocities, then positions and walls.
 
-    The list of edges is taken as it is; `advance` renews it in time. `contacts` computes the forces.
+    The list of edges is taken as it is; `advance` renews it in time.
     """
     forces, edges, history = contacts(packing, motion, state)
     dt = motion.time_step
@@ -111,27 +109,24 @@ def run(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _run_while_listed(devices: Devices | None, *given: Any) -> tuple[State, tuple[Array, Array]]:
-    return sharded(_while_listed, devices, *given)
+    """Steps while the list is complete: no particle further than half the skin from where it was listed."""
 
+    def loop(contacts: Contacts, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""]) -> Any:
+        def list_valid(carry):
+            state, done, _ = carry
+            away = jnp.max(jnp.sum((state.position - state.listed_at) ** 2, axis=1))
+            return (done < steps) & (away <= (state.skin / 2) ** 2)
 
-def _while_listed(
-    contacts: Contacts, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""]
-) -> tuple[State, tuple[Array, Array]]:
-    """Steps for as long as the list is complete: no particle further than half the skin from where it was listed."""
+        def one(carry):
+            state, done, on_wall = carry
+            state, forces = step(packing, motion, state, contacts)
+            return state, done + 1, on_wall + forces.on_wall
 
-    def list_valid(carry):
-        state, done, _ = carry
-        away = jnp.max(jnp.sum((state.position - state.listed_at) ** 2, axis=1))
-        return (done < steps) & (away <= (state.skin / 2) ** 2)
+        walls = jnp.zeros((len(state.walls), 3), state.velocity.dtype)
+        state, done, on_wall = jax.lax.while_loop(list_valid, one, (state, jnp.zeros_like(steps), walls))
+        return state, (done, on_wall)
 
-    def one(carry):
-        state, done, on_wall = carry
-        state, forces = step(packing, motion, state, contacts)
-        return state, done + 1, on_wall + forces.on_wall
-
-    walls = jnp.zeros((len(state.walls), 3), state.velocity.dtype)
-    state, done, on_wall = jax.lax.while_loop(list_valid, one, (state, jnp.zeros_like(steps), walls))
-    return state, (done, on_wall)
+    return sharded(loop, devices, *given)
 
 
 def advance(
@@ -163,7 +158,7 @@ def advance(
         The state at the end, with the walls still moving, and the rows.
 
     Raises:
-        InputError: if a particle left the walls or a position became NaN. The state passed in is untouched.
+        InputError: if a particle left the walls or a position became NaN.
     """
     rows, steps = arguments.whole(rows, "rows"), arguments.whole(steps, "steps")
     skin = arguments.number(skin, "skin [m]", least=0)
@@ -197,23 +192,13 @@ def replay(
     state: State,
     tape: Sequence[Segment],
     devices: Devices | None = None,
-    keep: Keep = "steps",
 ) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
-    A gradient through thousands of steps is exact for that trajectory, and of little use for compaction, because
-    rearrangements are chaotic (see `compact`).
-
-    Args:
-        packing: as in `advance`.
-        motion: as in `advance`.
-        state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
-        tape: of one call of `advance`.
-        devices: as in `run`.
-        keep: what reverse mode keeps on its way: the states of all steps, or, for long motions, those between lists
-            only; each step is then computed again.
+    The state is the one `advance` started from, with the walls' velocities set (`set_velocity`); packing, motion and
+    devices are as there. A gradient through thousands of steps is exact for that trajectory, and of little use for
+    compaction, because rearrangements are chaotic (see `compact`).
     """
-    arguments.choice(keep, get_args(Keep), "keep")
     if not tape:
         return state
     longest = max(int(segment.steps) for segment in tape)
@@ -224,8 +209,7 @@ def replay(
         return run(packing, motion, state, longest, segment.steps, devices), None
 
     first = with_list(state.edges, segments.key[0], segments.i[0], segments.j[0])  # as long as all others
-    state = replace(state, edges=first)
-    return jax.lax.scan(jax.checkpoint(one) if keep == "lists" else one, state, segments)[0]
+    return jax.lax.scan(one, replace(state, edges=first), segments)[0]
 
 
 def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
@@ -233,8 +217,8 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
 
     .. math:: \Delta t = s \min_i \sqrt{m_i / k_i}
 
-    with k_i the steepest slope of unloading of particle i against its like from eta_p eps = 0.67, some thirty times the
-    initial stiffness; above that range take less. The safety s = 0.3 allows for several contacts a particle.
+    with k_i the steepest slope of unloading of particle i against its like from eta_p eps = 0.67; above that range take
+    less. The safety s = 0.3 allows for several contacts a particle.
     """
     safety = arguments.number(safety, "safety", above=0)
 

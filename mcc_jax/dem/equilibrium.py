@@ -110,14 +110,17 @@ class Balance(eqx.Module):
     on_wall: Float[Array, " walls"]
 
 
-def net_force(problem: Problem, position: Vectors) -> Vectors:
-    r"""Force on every particle [N], :math:`f(x) - \mu (x - x_{prev})`.
+def forces(problem: Problem, position: Vectors) -> tuple[Vectors, Float[Array, " walls"]]:
+    r"""Force on every particle [N], :math:`f(x) - \mu (x - x_{prev})`, and on each wall along its normal [N].
 
     Contacts load where the overlap is above the largest so far and unload below: backward Euler in the history.
     """
     i, j, overlap, normal = _pairs(problem, position)
+    inward, wall_overlap = _wall_geometry(problem, position)
     force = jax.lax.optimization_barrier(jax.vmap(pair_force)(i, j, problem.edges.overlap_max, overlap))
-    return _net(problem, position, force, normal, *_on_walls(problem, position))
+    against = _each_wall(wall_force)(problem.packing.sides, problem.wall_history.overlap_max.T, wall_overlap)
+    against = jax.lax.optimization_barrier(against)
+    return _net(problem, position, force, normal, against, inward), jnp.sum(against, axis=1)
 
 
 def _net(problem: Problem, position: Vectors, force: Array, normal: Array, against: Array, inward: Array) -> Vectors:
@@ -170,23 +173,10 @@ def remembered(problem: Problem, position: Vectors) -> tuple[Edges, WallHistory]
     return edges, replace(history, overlap_max=largest_overlap(history.overlap_max, wall_overlap.T))
 
 
-def force_on_walls(problem: Problem, position: Vectors) -> Float[Array, " walls"]:
-    """Force on each wall along its normal [N], all particles added up; differentiable."""
-    return jnp.sum(_on_walls(problem, position)[0], axis=1)
-
-
 def _pairs(problem: Problem, position: Vectors) -> tuple[HalfContact, HalfContact, Array, Array]:
     """Both sides, overlap and normal of every edge."""
     sides = (sides_of(problem.packing.sides, k) for k in (problem.edges.i, problem.edges.j))
     return jax.lax.optimization_barrier((*sides, *pair_geometry(problem.packing.radius, position, problem.edges)))
-
-
-def _on_walls(
-    problem: Problem, position: Vectors
-) -> tuple[Float[Array, "walls particles"], Float[Array, "walls particles 3"]]:
-    inward, overlap = _wall_geometry(problem, position)
-    force = _each_wall(wall_force)(problem.packing.sides, problem.wall_history.overlap_max.T, overlap)
-    return jax.lax.optimization_barrier(force), inward
 
 
 def _wall_geometry(problem: Problem, position: Vectors) -> tuple[Array, Array]:
@@ -325,7 +315,7 @@ def find_equilibrium(problem: Problem, guess: Vectors, rtol: Scalar | float, max
         energy, solver, jax.lax.stop_gradient(guess), fixed, has_aux=True, max_steps=max_steps, throw=False
     )
     at = found.aux
-    position = _implicit(found.value, at.stiffness, net_force(problem, found.value))
+    position = _implicit(found.value, at.stiffness, forces(problem, found.value)[0])
     return Equilibrium(position, at, found.result == optx.RESULTS.successful, found.stats["num_steps"])
 
 

@@ -19,7 +19,7 @@ from .._types import Flag, Scalar, ScalarLike, scalar
 from .neighbours import Edges, overlap_and_normal
 from .pair import HalfContact, largest_overlap, pair_force, wall_force
 from .state import Packing, State, Vectors, WallHistory
-from .walls import Vector, Wall, Walls, dot
+from .walls import Vector, Wall, Walls, dot, length_of
 
 
 def _share(value: ScalarLike | None) -> Any:
@@ -217,21 +217,16 @@ def _contact(
     sliding = relative - opening * normal
     in_plane = slip - dot(slip, normal) * normal
     sliding, push, in_plane = jax.lax.optimization_barrier((sliding, push, in_plane))
-    slip = in_plane * recompute(_norm(slip) / (_norm(in_plane) + jnp.finfo(slip.dtype).tiny ** 0.5))
+    before, after = length_of(dot(slip, slip)), length_of(dot(in_plane, in_plane))
+    slip = in_plane * recompute(before / (after + jnp.finfo(slip.dtype).tiny ** 0.5))
     slip = slip + motion.time_step * sliding
     stiffness = motion.interaction.tangential_ratio * k
     trial = stiffness * slip + damping * recompute(jnp.sqrt(mass * stiffness)) * sliding
     slip, trial = jax.lax.optimization_barrier((slip, trial))
     limit = friction * push
-    size = _norm(trial)
+    size = length_of(dot(trial, trial))
     slips = size > limit
     tangential = trial * jnp.where(slips, recompute(limit / jnp.where(slips, size, 1.0)), 1.0)
     tangential = jax.lax.optimization_barrier(tangential)
     held = jnp.where(slips, tangential * recompute(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
     return tangential - push * normal, jnp.cross(normal, tangential), jnp.where(touching, held, 0.0)
-
-
-def _norm(vector: Vector) -> Scalar:
-    square = dot(vector, vector)
-    some = square > 0
-    return jnp.where(some, recompute(jnp.sqrt(jnp.where(some, square, 1.0))), 0.0)

@@ -33,7 +33,6 @@ class Edges(eqx.Module):
         i, j: particles of the pair, i < j; 0 in padding.
         overlap_max: largest overlap so far [m].
         slip: elastic tangential displacement of j's surface against i's [m].
-        wanted: number of pairs asked for; larger than the capacity if the list overflowed.
         particles: N.
     """
 
@@ -42,7 +41,6 @@ class Edges(eqx.Module):
     j: Int[Array, " edges"]
     overlap_max: Float[Array, " edges"]
     slip: Float[Array, "edges 3"]
-    wanted: Int[Array, ""]
     particles: int = eqx.field(static=True)
 
     __repr__ = described()
@@ -56,11 +54,6 @@ class Edges(eqx.Module):
     def active(self) -> Bool[Array, " edges"]:
         """Which places hold a pair."""
         return self.key != PADDING
-
-    @property
-    def overflow(self) -> Flag:
-        """Whether the list is too short and pairs were left out."""
-        return self.wanted > self.capacity
 
 
 def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tuple[Scalar, Vector]:
@@ -131,10 +124,9 @@ def _pairs_within(position: np.ndarray, cutoff: float) -> np.ndarray:
 def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type = np.float64) -> Edges:
     """Edges of virgin contacts from pairs of indices, shape (pairs, 2), in any order; repetitions are dropped.
 
-    The list has the length `capacity`; if the pairs do not fit, `Edges.overflow` is true.
-
     Raises:
-        InputError: if an index is not of a particle, a particle is paired with itself, or without double precision.
+        InputError: if the pairs do not fit into a list of the length `capacity`, an index is not of a particle, a
+            particle is paired with itself, or without double precision.
     """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
@@ -146,12 +138,13 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
     wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))
     if wrong.size:
         raise InputError(f"pair {wrong[0]} joins {pairs[wrong[0]].tolist()}", remedy=f"Name two of {particles}.")
-    key = np.unique(low * particles + high)
-    kept = np.full(capacity, PADDING)
-    kept[: min(key.size, capacity)] = key[:capacity]
-    i, j = (jnp.asarray(x, jnp.int32) for x in np.divmod(np.where(kept == PADDING, 0, kept), particles))
-    history = jnp.zeros(capacity, dtype), jnp.zeros((capacity, 3), dtype)
-    return Edges(jnp.asarray(kept), i, j, *history, jnp.asarray(key.size), particles)
+    used = np.unique(low * particles + high)
+    if used.size > capacity:
+        problem = f"{used.size} pairs do not fit into a list of {capacity} edges"
+        raise InputError(problem, remedy="Take a larger `capacity`.")
+    key = np.concatenate([used, np.full(capacity - used.size, PADDING)])
+    i, j = (jnp.asarray(x, jnp.int32) for x in np.divmod(np.where(key == PADDING, 0, key), particles))
+    return Edges(jnp.asarray(key), i, j, jnp.zeros(capacity, dtype), jnp.zeros((capacity, 3), dtype), particles)
 
 
 @jax.jit
@@ -166,11 +159,13 @@ def carry_history(old: Edges, new: Edges) -> Edges:
 def with_list(old: Edges, key: Array, i: Array, j: Array) -> Edges:
     """The contacts on another list of the same particles, with the history of the pairs that were in the old one."""
     overlap_max, slip = jnp.zeros(key.shape[0], old.slip.dtype), jnp.zeros((key.shape[0], 3), old.slip.dtype)
-    return carry_history(old, Edges(key, i, j, overlap_max, slip, old.wanted, old.particles))
+    return carry_history(old, Edges(key, i, j, overlap_max, slip, old.particles))
 
 
 def stacked_lists[Recorded: Any](tape: Sequence[Recorded]) -> Recorded:
     """Named tuples with a list of edges each (`key`, `i`, `j`) as one with a leading axis, padded to one length."""
+    if not tape:
+        raise InputError("an empty tape", remedy="Pass the list that `advance` or `compact` filled.")
     longest = max(step.key.shape[0] for step in tape)
     padded = []
     for step in tape:

@@ -101,11 +101,10 @@ def half_contact(law: MccLaw, particle: Particle, normal: Float[Array, " 3"] | N
     .. math:: F(d) = \pi R_e^2\, \sigma(\eta_p d / R_e), \qquad \Delta = R_e\, \delta(\eta_p, d_P / R_e)
 
     with the semi-axes a, b, c = D1/2, D2/2, D3/2, and :math:`\sigma, \delta` of the law (its `a` is :math:`a_s`). R_e
-    is the radius of Gaussian curvature of the ellipsoid where its tangent plane has that normal. Along e3 this is the
-    paper's particle exactly; in other directions it is our own generalisation, which no test supports yet.
-
-    Effects on parameters (size, shape) take the particle as it is tested, along D3; those on the modulus take strain
-    and stress of this side at its own peak.
+    is the radius of Gaussian curvature where the tangent plane of the ellipsoid has that normal. Along e3 this is the
+    paper's particle exactly; in other directions it is our own generalisation, which no test supports yet. Effects on
+    parameters (size, shape) take the particle as it is tested, along D3; those on the modulus take strain and stress of
+    this side at its own peak.
 
     Args:
         law: the particle's own law; particles of one pair may differ in all of it but the unloading form.
@@ -293,7 +292,16 @@ def _ratio(span: Scalar, drop: Scalar) -> tuple[Scalar, Scalar]:
 
 @jax.custom_jvp
 def _series(i: Contact, j: Contact, overlap: Scalar) -> _Series:
-    return _solve(i, j, overlap)
+    whole = jnp.where(overlap > 0, overlap, 0.0)
+    # A barrier closes the iteration, here and within: without, XLA iterates again for each use.
+    d = jax.lax.optimization_barrier(_split(i, j, whole))
+    # One more step, on both sides separately: next to a much stiffer side, what is left of the overlap has no digits.
+    rest = whole - d
+    force_i, force_j = i.loading(d), j.loading(rest)
+    t_i, t_j = _tangent(i, d), _tangent(j, rest)
+    flexibility = recompute(1 / (t_i + t_j))
+    change = flexibility * (force_i - force_j)
+    return _Series(d - change, rest + change, flexibility * (t_j * force_i + t_i * force_j))
 
 
 @_series.defjvp
@@ -316,19 +324,6 @@ def _series_change(i: Contact, j: Contact, series: _Series, di: Contact, dj: Con
         flexibility * (t_i * doverlap + change_i - change_j),
         flexibility * (t_i * t_j * doverlap + t_j * change_i + t_i * change_j),
     )
-
-
-def _solve(i: Contact, j: Contact, overlap: Scalar) -> _Series:
-    whole = jnp.where(overlap > 0, overlap, 0.0)
-    # A barrier closes the iteration, here and within: without, XLA iterates again for each use.
-    d = jax.lax.optimization_barrier(_split(i, j, whole))
-    # One more step, on both sides separately: next to a much stiffer side, what is left of the overlap has no digits.
-    rest = whole - d
-    force_i, force_j = i.loading(d), j.loading(rest)
-    t_i, t_j = _tangent(i, d), _tangent(j, rest)
-    flexibility = recompute(1 / (t_i + t_j))
-    change = flexibility * (force_i - force_j)
-    return _Series(d - change, rest + change, flexibility * (t_j * force_i + t_i * force_j))
 
 
 def _split(i: Contact, j: Contact, whole: Scalar) -> Scalar:

@@ -17,7 +17,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Scalar
-from .equilibrium import Equilibrium, Problem, find_equilibrium, force_on_walls, net_force, remembered
+from .equilibrium import Equilibrium, Problem, find_equilibrium, forces, remembered
 from .neighbours import Edges, pair_geometry, stacked_lists, with_list
 from .state import Packing, State, Vectors, WallHistory, check_packing, check_state, measured, rebuild_list, start
 from .walls import Cylinder, Plane, Walls
@@ -34,8 +34,8 @@ class Solver(eqx.Module):
         rtol: largest net force over the mean contact force.
         max_steps: evaluations before an equilibrium is given up.
         halvings: how often a load step that did not converge is halved.
-        skin: extra distance up to which pairs are listed, as a share of the mean radius, so large that load steps
-            rarely end with unlisted particles touching: these are solved again from there, and may end elsewhere.
+        skin: extra distance up to which pairs are listed, as a share of the mean radius. Load steps that end with
+            unlisted particles touching are solved again from there, and may end elsewhere.
     """
 
     springs: tuple[float, ...] = eqx.field(static=True, default=(1e-1, 1e-2, 1e-3, 1e-4))
@@ -56,10 +56,8 @@ class Solver(eqx.Module):
 
 
 class LoadStep(NamedTuple):
-    """What `replay_compaction` needs of a load step.
-
-    Its list of edges, the height of the top punch [m], the stiffness of the proximal springs [N/m], centres at its end
-    [m], and whether a row of the table ends with it.
+    """A load step for `replay_compaction`: its list of edges, the height of the top punch [m], the stiffness of the
+    proximal springs [N/m], centres at its end [m], and whether a row of the table ends with it.
     """
 
     key: Int[Array, " edges"]
@@ -107,7 +105,7 @@ class Compaction(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """One load step; it is complete if it converged with the weakest springs."""
+    """A load step; complete if it converged with the weakest springs."""
 
     state: State
     equilibrium: Equilibrium
@@ -121,10 +119,9 @@ class _Attempt(NamedTuple):
 def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None = None, passes: int = 40) -> State:
     """A state to start a compaction from: overlaps pushed apart, all contacts virgin.
 
-    Implicit steps of steepest descent on the contacts' energy (a proximal spring of 0.3 of the mean stiffness), at most
-    so many `passes`, until the contacts carry next to nothing. Above random close packing what overlap is left is where
-    the compaction begins. Scatter the spheres first (`scattered`) and lower them into the die; their centres [m] may
-    overlap.
+    The centres [m], scattered (`scattered`) and lowered into the die, may overlap. At most so many `passes`, implicit
+    steps of steepest descent on the contacts' energy, until the contacts carry next to nothing. Above random close
+    packing the compaction begins with what overlap is left.
     """
     solver = solver or Solver()
     passes = arguments.whole(passes, "passes")
@@ -165,7 +162,7 @@ def compact(
         tape: a list to which the load steps are appended, for `replay_compaction`.
 
     Returns:
-        The state at the end, at rest, and the rows; the state passed in is untouched.
+        The state at the end, at rest, and the rows.
 
     Raises:
         InputError: for walls that are not a die, a height that is not positive, or a particle outside the walls.
@@ -305,10 +302,8 @@ def die_walls(walls: Walls) -> tuple[Plane, Plane, Cylinder]:
 
 
 class Replayed(NamedTuple):
-    """The load steps again, all of it differentiable but `converged`; `edges` and `wall_history` are those at the end.
-
-    `on_wall` are forces on bottom, top and barrel along their normals [N], `proximal` sums of the springs' axial forces
-    without sign [N].
+    """The load steps again, differentiable: forces on bottom, top and barrel along their normals [N], centres [m],
+    edges and wall history at the end, residuals, sums of the springs' axial forces without sign [N].
     """
 
     on_wall: Float[Array, "steps walls"]
@@ -328,21 +323,14 @@ def replay_compaction(
     """The load steps that `compact` recorded, for this packing or one like it, differentiable in both modes.
 
     Lists of edges, heights and springs are those of the tape; the equilibria are found again, each from where the tape
-    has it, and differentiated by the implicit function theorem, history included. With a packing so different that
-    particles meet that the tape does not list, contacts are missing: compact it instead.
+    has it, and differentiated by the implicit function theorem, history included. Where other particles meet than the
+    tape lists, contacts are missing: compact such a packing instead.
     """
-    return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), solver or Solver())
-
-
-def stacked(tape: Sequence[LoadStep]) -> LoadStep:
-    """All load steps as one, every field with a leading axis; `InputError` if there are none."""
-    if not tape:
-        raise InputError("a compaction without load steps", remedy="Give `compact` a list as its `tape`.")
-    return stacked_lists(tape)
+    return eqx.filter_jit(replay_stacked)(packing, state, stacked_lists(tape), solver or Solver())
 
 
 def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
-    """`replay_compaction` of load steps that are `stacked`, to be traced."""
+    """`replay_compaction` of stacked load steps (`stacked_lists`), to be traced."""
 
     def one(carry, step):
         previous, recorded, edges, wall_history = carry
@@ -352,8 +340,9 @@ def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solv
         position = found.position
         edges, wall_history = remembered(problem, position)
         springs = step.spring * jnp.sum(jnp.abs(position[:, 2] - previous[:, 2]))
-        residual = jnp.max(jnp.abs(net_force(problem, position))) / found.balance.scale
-        row = force_on_walls(problem, position), position, residual, springs, found.converged
+        net, on_wall = forces(problem, position)
+        residual = jnp.max(jnp.abs(net)) / found.balance.scale
+        row = on_wall, position, residual, springs, found.converged
         return (position, step.position, edges, wall_history), row
 
     before = with_list(state.edges, steps.key[0], steps.i[0], steps.j[0])

@@ -34,13 +34,10 @@ def sharded[Moving: eqx.Module](
 ) -> tuple[Moving, Any]:
     """A loop over time steps with its contacts divided over devices; differentiable like the loop itself.
 
-    Edges, sorted by key, are divided in contiguous shares of equal length, and contacts with walls by particle. What
-    belongs to particles (positions, velocities, the packing) is on every device, and every device moves all of them. A
-    step needs one reduction, of one array of forces, torques and forces on walls.
-
-    The loop is called with what computes the contact forces, then with packing, motion, state and what is further. It
-    returns the state, and anything that is the same on all devices. Devices are those of one process or, after
-    `jax.distributed.initialize`, of all; None is no division.
+    Edges, sorted by key, are divided in contiguous shares of equal length, contacts with walls by particle. Every
+    device has and moves all particles; a step needs one reduction, of forces, torques and forces on walls. The loop is
+    called with what computes the contact forces, packing, motion, state and what is further; it returns the state, and
+    anything that is the same on all devices. Without devices nothing is divided.
     """
     if devices is None:
         return loop(contact_forces, packing, motion, state, *further)
@@ -67,10 +64,8 @@ def sharded[Moving: eqx.Module](
 def gathered[Moving: eqx.Module](
     run: Callable[..., tuple[Moving, Any]], devices: Devices | None, *arguments: Any
 ) -> tuple[Moving, Any]:
-    """Call a compiled `sharded` loop with values of this process and bring what it returns back to this process.
-
-    Neighbour lists are made on the host, by every process for itself and all alike.
-    """
+    """Call a compiled `sharded` loop with values of this process and bring what it returns back to it, where neighbour
+    lists are made: by every process for itself and all alike."""
     if devices is None:
         return run(None, *arguments)
     given = jax.tree.map(np.asarray, arguments)

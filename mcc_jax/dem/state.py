@@ -56,14 +56,9 @@ def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")  # traced ones pass
     density = arguments.number(density, "density [kg/m^3]", above=0)
-    batched = law.a.ndim == 1 or law.plastic.C1.ndim == 1
-    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, law) if batched else None
-
-    def one(law: MccLaw, diameter: Array):
-        return half_contact(law, Particle(diameter, diameter, diameter))
-
     radius = 0.5e-6 * diameter
-    sides = jax.vmap(one, (axes, 0))(law, diameter)
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, law)
+    sides = jax.vmap(lambda law, size: half_contact(law, Particle(size, size, size)), (axes, 0))(law, diameter)
     return Packing(radius, density * 4 / 3 * jnp.pi * radius**3, passive(sides))
 
 
@@ -141,14 +136,10 @@ class State(eqx.Module):
 
 
 def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: int | None = None) -> State:
-    """A state at rest: virgin contacts, a fresh list of edges.
+    """A state at rest, of centres [m]: virgin contacts, a fresh list of edges.
 
-    Args:
-        packing: the spheres.
-        walls: the walls.
-        position: the centres [m].
-        skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
-        capacity: length of the list of edges; a tenth more than there are pairs if None.
+    Pairs are listed up to an extra distance `skin` [m], for example a fifth of a radius; the list has the length
+    `capacity`, or a tenth more than there are pairs.
 
     Raises:
         InputError: if a position is not finite, a particle is outside the walls, a half contact resists nothing, or the
@@ -180,9 +171,6 @@ def rebuild_list(packing: Packing, state: State, skin: float, capacity: int | No
     if capacity is None and len(pairs) > length:
         length = 64 * math.ceil(SPARE * len(pairs) / 64 + 1)
     fresh = list_edges(pairs, len(state.position), length, state.edges.overlap_max.dtype)
-    if bool(fresh.overflow):
-        problem = f"{len(pairs)} pairs do not fit into a list of {length} edges"
-        raise InputError(problem, remedy="Take a larger `capacity`.")
     if state.edges.capacity:
         fresh = carry_history(state.edges, fresh)
     return replace(state, edges=fresh, listed_at=state.position, skin=jnp.asarray(skin, state.skin.dtype))

@@ -21,12 +21,14 @@ from .._format import described
 from ..calibrate import Posterior
 from ..calibrate.population import Scatter, flattened, particles_at
 from ..law import MccLaw, Plastic
-from .quasistatic import TOP, Compaction, LoadStep, Replayed, Solver, compact, replay_stacked, stacked
+from .neighbours import stacked_lists
+from .quasistatic import TOP, Compaction, LoadStep, Replayed, Solver, compact, replay_stacked
 from .state import MCC_DENSITY, Packing, State, not_monotone, spheres
 
 PROBABILITY = (0.05, 0.5, 0.95)
 REDRAWS = 100  # of a particle's law, until it is monotone
 ROUNDS = 5  # compactions of a fit made again
+TOLERANCE = 1e-7  # of fitted parameters, relative and absolute
 
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""
@@ -78,21 +80,15 @@ def punch_sensitivity(
 
     in forward mode: one factorisation of the stiffness K a load step. The derivative is that of the branch the
     compaction took. Where contacts snap (`Compaction.largest_move`) a finite change of a parameter may move the snap to
-    another load step, which no derivative shows.
-
-    Args:
-        packing_of: the packing as a function of parameters; at `values` the one that made the tape.
-        values: parameters [any units].
-        state: start of `compact`.
-        tape: its load steps.
-        solver: its solver.
+    another load step, which no derivative shows. `packing_of` is the packing as a function of parameters, at `values`
+    the one that made the tape; state, tape and solver are those of `compact`.
     """
     values = jnp.asarray(values, float)
     last = np.array([step.last for step in tape])
     # Outside the compiled function: that one then is the same for all parametrisations.
     direction = jax.jacfwd(packing_of)(values)
     packing = packing_of(values)
-    jacobian, (force, replayed) = _jacobian(packing, direction, state, stacked(tape), solver or Solver())
+    jacobian, (force, replayed) = _jacobian(packing, direction, state, stacked_lists(tape), solver or Solver())
     force, jacobian = np.asarray(force), np.asarray(jacobian)
     by_stress, pressed = jacobian[last, len(values) :], force > 0
     share = np.where(pressed, np.asarray(replayed.proximal) / np.where(pressed, force, 1.0), np.inf)
@@ -138,11 +134,10 @@ class Band(NamedTuple):
 
     Attributes:
         probability, quantiles: force on the top punch [N], (probabilities, rows).
-        standard_deviation: of that force [N]; infinite where a single draw converged.
-        used: draws that converged in a row; in the first-order band 1 where the one compaction did, else 0.
-        not_monotone: the most particles whose force falls on loading, over all draws used.
-        compaction, sensitivity: of the compaction at the mean of the draws (first order only).
-        forces: of every draw [N], NaN where it did not converge, (draws, rows) (by draws only).
+        standard_deviation: of that force [N].
+        converged: rows in which the compaction is in equilibrium, as all before.
+        not_monotone: particles whose force falls on loading.
+        compaction, sensitivity: those at the mean of the draws.
     """
 
     height: np.ndarray
@@ -150,11 +145,10 @@ class Band(NamedTuple):
     probability: np.ndarray
     quantiles: np.ndarray
     standard_deviation: np.ndarray
-    used: np.ndarray
+    converged: np.ndarray
     not_monotone: int
-    compaction: Compaction | None = None
-    sensitivity: Sensitivity | None = None
-    forces: np.ndarray | None = None
+    compaction: Compaction
+    sensitivity: Sensitivity
 
     __repr__ = described()
 
@@ -166,9 +160,8 @@ def population_packing(
 
     The z of every particle are drawn once and kept, so that a draw of the population moves all particles together: the
     band is about the population, not about which particles one happened to take. Particles not monotone at the
-    posterior mean are redrawn. Effects of the model act in the contacts, but for those of the instrument.
-
-    Diameters are in um, the density of a particle in kg/m^3.
+    posterior mean are redrawn. Effects of the model act in the contacts, but for those of the instrument. Diameters are
+    in um, the density of a particle in kg/m^3.
 
     Raises:
         InputError: if the population hardly has a monotone law; for effects that contacts cannot have, by name.
@@ -232,7 +225,9 @@ def first_order_band(
 
     `draws` are of the parameters, one row each; state, heights and solver are those of `compact`.
     """
-    draws = _checked(draws, probability)
+    draws = arguments.floats(draws, "draws", shape="a table with one row for each draw")
+    if draws.ndim != 2 or len(draws) < 2 or not np.isfinite(draws).all():
+        raise InputError("draws that are not a table of two or more finite rows", remedy="One row for each draw.")
     mean = draws.mean(axis=0)
     packing, tape = packing_of(jnp.asarray(mean)), list[LoadStep]()
     _, rows = compact(packing, state, heights, solver, tape)
@@ -246,59 +241,11 @@ def first_order_band(
         np.asarray(probability, float),
         rows.top + z[:, None] * deviation,
         deviation,
-        found.converged.astype(int),
+        found.converged,
         int(not_monotone(packing).sum()),
-        compaction=rows,
-        sensitivity=found,
+        rows,
+        found,
     )
-
-
-def band_by_draws(
-    packing_of: PackingOf,
-    draws: Float[np.ndarray, "draws parameters"],
-    state: State,
-    heights: Float[np.ndarray, " rows"],
-    *,
-    probability: Sequence[float] = PROBABILITY,
-    solver: Solver | None = None,
-) -> Band:
-    """Band from one whole compaction for each draw: no linearisation, snaps and all; else as `first_order_band`.
-
-    Raises:
-        InputError: if no draw converged in a row.
-    """
-    draws = _checked(draws, probability)
-    packings = [packing_of(jnp.asarray(values)) for values in draws]
-    every = [compact(packing, state, heights, solver)[1] for packing in packings]
-    # A row that did not converge hands its history on.
-    forces = np.stack([np.where(np.logical_and.accumulate(rows.converged), rows.top, np.nan) for rows in every])
-    rows = every[0]
-    used = np.isfinite(forces).sum(axis=0)
-    if (used == 0).any():
-        raise InputError(
-            f"no draw converged at the height {rows.height[np.argmin(used)]:.6g} m",
-            remedy="Smaller load steps, or more halvings (`Solver.halvings`).",
-        )
-    squares = np.nansum((forces - np.nanmean(forces, axis=0)) ** 2, axis=0)
-    return Band(
-        rows.height,
-        rows.density,
-        np.asarray(probability, float),
-        np.nanquantile(forces, np.asarray(probability, float), axis=0),
-        np.where(used > 1, np.sqrt(squares / np.maximum(used - 1, 1)), np.inf),
-        used,
-        max(int(not_monotone(packing).sum()) for packing in packings),
-        forces=forces,
-    )
-
-
-def _checked(draws: np.ndarray, probability: Sequence[float]) -> np.ndarray:
-    draws = arguments.floats(draws, "draws", shape="a table with one row for each draw")
-    if draws.ndim != 2 or len(draws) < 2 or not np.isfinite(draws).all():
-        raise InputError("draws that are not a table of two or more finite rows", remedy="One row for each draw.")
-    if not all(0 < p < 1 for p in probability):
-        raise InputError(f"a probability outside 0 to 1 in {tuple(probability)}", remedy="For example 0.05, 0.5, 0.95.")
-    return draws
 
 
 class CompactionFit(NamedTuple):
@@ -327,30 +274,21 @@ def fit_compaction(
     force: Any,
     *,
     solver: Solver | None = None,
-    tolerance: float = 1e-7,
 ) -> CompactionFit:
     r"""Parameters whose compaction curve comes closest to a measured one, by Levenberg-Marquardt.
 
     .. math:: \min_\theta \sum_r \left(\frac{F_r(\theta) - F_r}{\max F}\right)^2
 
     with the sensitivities of the load steps. Within a round the load steps are those of a compaction at the round's
-    start (`replay_compaction`); rounds go on until the parameters stay, because contacts may snap elsewhere. Take
-    logarithms of positive parameters. The modulus needs rows of unloading.
-
-    Args:
-        packing_of: the packing as a function of the parameters; traced by JAX.
-        start: where to start.
-        state: as for `compact`.
-        heights: as for `compact`.
-        solver: as for `compact`.
-        force: on the top punch at the heights [N].
-        tolerance: of the parameters, relative and absolute.
+    start (`replay_compaction`); rounds go on until the parameters stay, because contacts may snap elsewhere.
+    `packing_of` is the packing as a function of parameters, of which `start` are the first: take logarithms of positive
+    ones; the modulus needs rows of unloading. State, heights and solver are as for `compact`, `force` is that on the
+    top punch at the heights [N].
 
     Raises:
         InputError: if heights and forces are not equally many, or fewer than the parameters.
     """
     solver = solver or Solver()
-    tolerance = arguments.number(tolerance, "tolerance", above=0)
     values, heights = arguments.path(start, "start"), arguments.path(heights, "heights")
     measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")
     if measured.shape != np.shape(heights) or measured.size < len(values) or not np.isfinite(measured).all():
@@ -365,8 +303,8 @@ def fit_compaction(
         tape: list[LoadStep] = []
         compact(packing_of(values), state, heights, solver, tape)
         before, rounds = values, rounds + 1
-        values = _least_squares(packing_of, values, state, stacked(tape), target, solver, tolerance)
-        stays = bool(jnp.all(jnp.abs(values - before) <= 10 * tolerance * (1 + jnp.abs(values))))
+        values = _least_squares(packing_of, values, state, stacked_lists(tape), target, solver)
+        stays = bool(jnp.all(jnp.abs(values - before) <= 10 * TOLERANCE * (1 + jnp.abs(values))))
     _, rows = compact(packing_of(values), state, heights, solver)
     misfit = float(np.sqrt(np.mean(((rows.top - measured) / measured.max()) ** 2)))
     return CompactionFit(np.asarray(values), rows, misfit, rounds, stays and bool(rows.converged.all()))
@@ -374,7 +312,7 @@ def fit_compaction(
 
 @eqx.filter_jit
 def _least_squares(
-    packing_of: PackingOf, start: Array, state: State, steps: LoadStep, target: Array, solver: Solver, tolerance: float
+    packing_of: PackingOf, start: Array, state: State, steps: LoadStep, target: Array, solver: Solver
 ) -> Array:
     ends = jnp.nonzero(steps.last, size=len(target))[0]
 
@@ -382,5 +320,5 @@ def _least_squares(
         replayed = replay_stacked(packing_of(values), state, steps, solver)
         return (replayed.on_wall[ends, TOP] - target) / jnp.max(target)
 
-    method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    method = optx.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
     return optx.least_squares(residuals, method, start, max_steps=64, throw=False).value

@@ -29,6 +29,12 @@ def dot(one: Vector, other: Vector) -> Scalar:
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
+def length_of(square: Scalar) -> Scalar:
+    """Length of a vector, from its square, with a finite derivative at zero."""
+    some = square > 0
+    return jnp.where(some, recompute(jnp.sqrt(jnp.where(some, square, 1.0))), 0.0)
+
+
 class Plane(eqx.Module):
     """A plane through a point [m]; its normal, a unit vector, points to the particles; it moves at a velocity [m/s]."""
 
@@ -77,12 +83,12 @@ class Cylinder(eqx.Module):
         """Distance [m] of a point from the wall, negative outside."""
         above = jnp.maximum(position[2] - self.rim, 0.0)
         opening = jnp.where(above > 0, self.chamfer * above, 0.0)
-        return self.radius + opening - _length(position[:2])
+        return self.radius + opening - length_of(position[0] * position[0] + position[1] * position[1])
 
     def normal_at(self, position: Vector) -> Vector:
         """Direction in which the wall pushes a particle there: towards the axis."""
         flat = jnp.stack([position[0], position[1], jnp.zeros_like(position[2])])
-        length = _length(position[:2])
+        length = length_of(dot(flat, flat))
         return -flat * recompute(1 / jnp.where(length > 0, length, 1.0))
 
     def moved(self, time: Scalar) -> Cylinder:
@@ -113,9 +119,3 @@ def set_velocity(walls: Walls, velocity: Any) -> Walls:
         eqx.tree_at(lambda w: w.velocity, wall, v.astype(wall.velocity.dtype))
         for wall, v in zip(walls, velocity, strict=True)
     )
-
-
-def _length(vector: Float[Array, " 2"]) -> Scalar:
-    """Length with a finite derivative at zero."""
-    square = vector[0] * vector[0] + vector[1] * vector[1]
-    return jnp.where(square > 0, recompute(jnp.sqrt(jnp.where(square > 0, square, 1.0))), 0.0)
