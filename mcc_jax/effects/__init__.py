@@ -4,7 +4,6 @@ from .effect import AbstractEffect as AbstractEffect
 from .effect import AbstractModulusAtPeak as AbstractModulusAtPeak
 from .effect import Factors as Factors
 from .library import LIBRARY as LIBRARY
-from .library import default_library as default_library
 from .library import find_variant as find_variant
 from .record import HUMIDITY_COLUMN as HUMIDITY_COLUMN
 from .record import REFERENCE_HUMIDITY_PERCENT as REFERENCE_HUMIDITY_PERCENT

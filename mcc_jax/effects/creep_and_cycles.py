@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, Values
 from .effect import AbstractEffect, pick
-from .record import HOLD, RELOAD, UNLOAD, Context, reload_progress
+from .record import HOLD, RELOAD, UNLOAD, Context, power, reload_progress
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_TIME_S = 100.0
@@ -254,12 +254,6 @@ def _of_size(count):
     return lambda e, c: e.amplitude * c.particle.displacement(count(e, c.cycles))
 
 
-def _power(e: Ratcheting, cycles: Values) -> Values:
-    some = cycles > 0
-    power = jnp.exp(e.exponent * jnp.log(jnp.where(some, cycles, 1.0)))
-    return jnp.where(some, power, 0.0)
-
-
 class Ratcheting(AbstractEffect):
     """Permanent displacement with every reload, in proportion to size, to the peak, or to what is recovered."""
 
@@ -270,7 +264,7 @@ class Ratcheting(AbstractEffect):
         "linear": _of_size(lambda e, n: n),
         "logarithmic": _of_size(lambda e, n: jnp.log1p(n) / jnp.log(2.0)),
         "shakedown": _of_size(lambda e, n: -e.cycles_to_rest * jnp.expm1(-n / e.cycles_to_rest)),
-        "power": _of_size(_power),
+        "power": _of_size(lambda e, n: power(n, e.exponent)),
         "late": _of_size(lambda e, n: jnp.floor(n) + (n - jnp.floor(n)) ** 2),
         "elastic_share": lambda e, c: e.amplitude * c.recoverable * c.cycles,
         "peak_share": lambda e, c: e.amplitude * c.peak_displacement * c.cycles,

@@ -27,15 +27,14 @@ class AbstractEffect(eqx.Module):
     friction, hardening), `stiffness` (damage, densification), `inside` (creep, pop-in, adhesion; several add up) and
     `observe` (frame, drift, platens). An effect with a memory of its own also gives `driver`, `start` and `evolve`.
 
-    Hooks are plain arithmetic on scalars or arrays over points, so that `vmap`, `jvp` and `grad` pass through. They
-    must be finite with finite derivatives at zero force, on full release, at repeated points and at amplitude zero,
-    where they must change nothing. A field that switches a part of a formula on is a number, 0 or 1: formulas that
-    differ in it alone are compiled once where many are derived together (`mcc_jax.law.signatures`).
+    Hooks are plain arithmetic on scalars or arrays over points, finite with finite derivatives at zero force, on full
+    release, at repeated points and at amplitude zero, where they must change nothing. A field that switches a part of a
+    formula on is a number, 0 or 1: formulas that differ in it alone share what `mcc_jax.law.signatures` compiles.
 
     Attributes:
         closed: whether all it does is a formula of particle and peak, without time, cycles or humidity: `modify` of the
-            particle alone, or the `AbstractModulusAtPeak`. Energy, particle codes and exports to other engines take
-            those only. Set it on the class.
+            particle alone, or an `AbstractModulusAtPeak`. Energy, particle codes and exports take those only. Set it on
+            the class.
         formulas: where the hooks of several formulas differ in one expression, these by name: functions of the effect
             and of what its hook gives them. Set it on the class.
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
@@ -137,5 +136,5 @@ def on_terms(chosen: tuple[Any, Any, Any], factor: Values) -> Factors:
 
 
 def at_least(x: Values, least: float | Values = MIN_FACTOR) -> Values:
-    """`x`, but not below a floor: keeps a factor positive that an amplitude far from null would turn negative."""
+    """`x`, but not below a floor."""
     return jnp.where(x > least, x, least)

@@ -36,12 +36,7 @@ LIBRARY: Mapping[str, Mechanism] = _Library(
     unloading.SHAPE_OF_UNLOADING, material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION,
     contact.MISALIGNMENT, instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
 )  # fmt: skip
-"""The mechanisms known by name, in a fixed order."""
-
-
-def default_library() -> dict[str, Mechanism]:
-    """A copy of `LIBRARY` to add to."""
-    return dict(LIBRARY)
+"""The mechanisms known by name, in a fixed order; `dict(LIBRARY)` is a copy to add to."""
 
 
 def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Variant:

@@ -11,7 +11,7 @@ from .._types import Values
 from ..formulas import PUNCH_AREA, Formulas, recovery
 from ..geometry import Particle
 from .effect import AbstractEffect, Factors, at_least, on_terms
-from .record import Context, Record, contact_radius, root
+from .record import Context, Record, contact_radius, power, root
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_FORCE_RATE = 2.0  # mN/s
@@ -179,9 +179,7 @@ class HardeningAndLoad(Hardening):
 
     def inside(self, context: Context) -> Values:
         half_inverse, share = 0.5 * self.amplitude, context.load_share
-        some = share > 0
-        log = jnp.log(jnp.where(some, share, 1.0))
-        moved = jnp.where(some, share * jnp.exp(-half_inverse / (1 + half_inverse) * log), share)
+        moved = share * power(share, -half_inverse / (1 + half_inverse))
         return context.recoverable * (recovery(share) - recovery(jnp.where(moved < 1, moved, 1.0)))
 
 
@@ -190,9 +188,7 @@ class HardeningAndContact(Hardening):
 
     def inside(self, context: Context) -> Values:
         share = context.recovered_share
-        some = share > 0
-        power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / (1 + 0.5 * self.amplitude))
-        return context.recoverable * jnp.where(some, share - power, 0.0)
+        return context.recoverable * (share - power(share, 1 / (1 + 0.5 * self.amplitude)))
 
 
 _OLSSON = "Olsson and Larsson (2013)"

@@ -12,7 +12,7 @@ from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from .effect import AbstractEffect, AbstractModulusAtPeak, at_least, on_terms, pick
 from .loading import LoadingFactor
-from .record import REFERENCE_HUMIDITY_PERCENT, Context, Record, positive
+from .record import REFERENCE_HUMIDITY_PERCENT, Context, Record, positive, power
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_DIAMETER_UM = 200.0
@@ -219,12 +219,6 @@ DAMAGE = family(Damage, "damage",
 )  # fmt: skip
 
 
-def _locking_power(e: Locking, _: Particle, strain: Values) -> Values:
-    some = strain > 1e-9
-    power = jnp.exp(e.exponent * jnp.log(jnp.where(some, strain, 1.0) / LOCKING_STRAIN))
-    return 1 + e.amplitude * jnp.where(some, power, 0.0)
-
-
 def _locking_exponential(e: Locking, _: Particle, strain: Values) -> Values:
     at, most = e.exponent * strain, e.exponent * LOCKING_STRAIN
     return 1 + e.amplitude * (jnp.expm1(at) - at) / (jnp.expm1(most) - most)
@@ -235,7 +229,10 @@ class Locking(LoadingFactor):
 
     exponent: Any = None
 
-    formulas: ClassVar = {"locking": _locking_power, "locking_exponential": _locking_exponential}
+    formulas: ClassVar = {
+        "locking": lambda e, _, eps: 1 + e.amplitude * power(eps / LOCKING_STRAIN, e.exponent),
+        "locking_exponential": _locking_exponential,
+    }
 
 
 _FOAM = "Gibson and Ashby (1997), Cellular Solids, ch. 5"

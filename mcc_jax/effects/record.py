@@ -35,12 +35,18 @@ def positive(x: Values) -> Values:
     return jnp.where(x > 0, x, 0.0)
 
 
-class Record(eqx.Module):
-    """One test as an effect sees it; the same class holds one point of it (scalars) and many tests (a leading axis).
+def power(x: Values, exponent: Scalar) -> Values:
+    """`x**exponent` where x is above zero, else 0, with finite derivatives by both."""
+    some = x > jnp.finfo(x.dtype).tiny ** 0.5
+    return jnp.where(some, jnp.exp(exponent * jnp.log(jnp.where(some, x, 1.0))), 0.0)
 
-    Real forces are noisy. So everything that follows from differences of force is data here, found by the
-    segmentation of a campaign (`mcc_jax.campaign.record_of`) or, for a clean path, by its turning points
-    (`clean_record`). A point that repeats the one before, time included, changes nothing: padding is harmless.
+
+class Record(eqx.Module):
+    """One test as an effect sees it, one point of it (scalars), or many tests (a leading axis).
+
+    Real forces are noisy. So everything that follows from differences of force is data here, found by the segmentation
+    of a campaign (`mcc_jax.campaign.record_of`) or, for a clean path, by its turning points (`clean_record`). A point
+    that repeats the one before, time included, changes nothing: padding is harmless.
 
     Attributes:
         force: force [mN].

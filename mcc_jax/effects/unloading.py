@@ -12,18 +12,11 @@ from .._types import Values
 from ..formulas import PUNCH_AREA, recovery, stress_ratio
 from .creep_and_cycles import NORM
 from .effect import AbstractEffect, pick
-from .record import RELOAD, Context, contact_of, positive, reload_progress
+from .record import RELOAD, Context, contact_of, positive, power, reload_progress
 from .variant import Need, Nuisance, family, row
 
 BISECTIONS = 50
 LAST_CONTACT = 0.3  # radius over that at the peak: there, at 1 % of the load, half of a constant pull is left
-
-
-def _power_law(e: Bow, share: Values) -> Values:
-    """From the arcsine towards a power law of what is still to recover, as indentation records are reduced by."""
-    some = share > 0
-    power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / e.exponent)
-    return jnp.where(some, recovery(share) - (1 - power), 0.0)
 
 
 class Bow(AbstractEffect):
@@ -38,7 +31,8 @@ class Bow(AbstractEffect):
         "symmetric_bow": lambda e, u: 4 * u * (1 - u),
         "tail_bow": lambda e, u: NORM * u * (1 - u) ** 2,
         "onset_bow": lambda e, u: NORM * u**2 * (1 - u),
-        "power_law": _power_law,
+        # From the arcsine towards a power law of what is still to recover.
+        "power_law": lambda e, u: recovery(u) - (1 - power(u, 1 / e.exponent)),
     }
 
     def inside(self, context: Context) -> Values:
@@ -50,9 +44,7 @@ class RecoveryExponent(AbstractEffect):
 
     def inside(self, context: Context) -> Values:
         s = context.recovered_share
-        some = s > 0
-        power = jnp.exp(self.amplitude * jnp.log(jnp.where(some, s, 1.0)))
-        return context.recoverable * jnp.where(some, s * (1 - power), 0.0)
+        return context.recoverable * s * (1 - power(s, self.amplitude))
 
 
 SHAPE_OF_UNLOADING = family(Bow, "unloading_shape",

@@ -38,8 +38,7 @@ class Need(enum.Enum):
 class Nuisance:
     """A further number of a formula, without meaning while the amplitude is zero.
 
-    It is absolute (seconds, MPa, mN, a share of the particle's own peak), never relative to a whole test, so that the
-    effect can be followed point by point.
+    It is absolute (seconds, MPa, mN, a share of the particle's own peak), never relative to a whole test.
 
     Attributes:
         name: with the unit.
@@ -141,7 +140,7 @@ class Variant:
         return replace(self.make(strength, **others, **self.fixed), label=self.label)
 
     def check_names(self, nuisance: Mapping[str, Any]) -> None:
-        """Raise `InputError` for a further number that the formula does not have."""
+        """Refuse a further number that the formula does not have."""
         known = [n.name for n in self.nuisances]
         for name in sorted(set(nuisance) - set(known)):
             raise InputError(f"{self.label} has no parameter {name!r}; it has: {', '.join([self.parameter, *known])}")

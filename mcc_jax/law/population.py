@@ -88,15 +88,7 @@ class PlasticPopulation(eqx.Module):
     @property
     def probability_not_monotone(self) -> Scalar:
         r"""Share of particles with :math:`9 C_3^6 > 20 C_1 C_5^5`: a normal tail, as log C enters linearly."""
-        return self._softer_than(20 / 9)
-
-    @property
-    def probability_tensile(self) -> Scalar:
-        r"""Share of particles whose quintic is negative somewhere, :math:`C_3^6 > 4 C_1 C_5^5`."""
-        return self._softer_than(4.0)
-
-    def _softer_than(self, limit: float) -> Scalar:
-        gap = jnp.log(limit) + self.C1.mean + 5 * self.C5.mean - 6 * self.C3.mean
+        gap = jnp.log(20 / 9) + self.C1.mean + 5 * self.C5.mean - 6 * self.C3.mean
         spread = jnp.sqrt(self.C1.sd**2 + 25 * self.C5.sd**2 + 36 * self.C3.sd**2)
         return norm.cdf(-gap / spread)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tested import BASE, LAW, NAMES, PARTICLE, RECORD, VARIANTS, respond
 
-from mcc_jax.effects import LIBRARY, AbstractEffect, Mechanism, Nuisance, default_library, find_variant
+from mcc_jax.effects import LIBRARY, AbstractEffect, Mechanism, Nuisance, find_variant
 
 CONTRACT = [
     "frame_compliance", "thermal_drift", "creep", "rate_dependence", "adhesion", "damage", "densification_stiffening",
@@ -66,7 +66,6 @@ def test_what_differs_from_test_to_test_is_marked():
 def test_names_lead_to_variants():
     assert find_variant("creep") is LIBRARY["creep"].variants[0]
     assert find_variant("creep:power_law").name == "power_law"
-    assert "creep" in default_library()
     with pytest.raises(ValueError, match="Known: frame_compliance, thermal_drift"):
         find_variant("wobble")
     with pytest.raises(ValueError, match="creep has no variant 'x'; it has: kelvin_voigt"):

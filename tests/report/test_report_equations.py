@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from mcc_jax.effects import default_library
+from mcc_jax.effects import LIBRARY
 from mcc_jax.report.texts import GREEK, equation
 
 
@@ -17,7 +17,7 @@ def test_equations_are_written_with_greek_letters_indices_and_powers():
     assert equation("<b>F</b>") == "&lt;<i>b</i>&gt;<i>F</i>&lt;/<i>b</i>&gt;"
 
 
-@pytest.mark.parametrize("variant", [v for m in default_library().values() for v in m.variants], ids=lambda v: v.name)
+@pytest.mark.parametrize("variant", [v for m in LIBRARY.values() for v in m.variants], ids=lambda v: v.name)
 def test_no_equation_of_the_library_loses_anything(variant):
     """Without the marks of the page every letter, number and bracket is still there, in order."""
     text = re.sub(r"<[^<>]+>", "", equation(variant.equation))
