@@ -1,21 +1,17 @@
 """Effects in particle codes: parameters and the modulus at the peak, and what is refused."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_pair_law import ON_PATH, PARTICLE, UM, WALL_PATH, cycle, driven, law_of
+from test_pair_law import ON_PATH, PARTICLE, UM, cycle, driven, law_of, on_pair, on_wall, with_all
 
 from benchmarks import energy_paths
 from mcc_jax import InputError, Particle, Unloading, drive
 from mcc_jax.dem import (
     half_contact,
     load_state,
-    pair_energy,
-    pair_force,
     pair_recovery,
     save_state,
     spheres,
@@ -32,20 +28,6 @@ AT_PEAK = [v for v in CLOSED if v.mechanism in ("damage", "densification_stiffen
 OTHERS = [v for m in LIBRARY.values() for v in m if v not in CLOSED]
 
 
-def named(variant):
-    return f"{variant.mechanism}:{variant.name}"
-
-
-def with_all(unloading, scaling=StrainScaling.CONTACT):
-    names = (
-        "damage:threshold",
-        "densification_stiffening:heckel",
-        "size_effect:flow_and_modulus",
-        "shape_second_order",
-    )
-    return law_of(unloading, scaling).with_effects(*names)
-
-
 # ---- physics ---------------------------------------------------------------------------------------------------------
 
 
@@ -55,15 +37,12 @@ def test_two_halves_are_the_plate_test(unloading):
     law, displacement = with_all(unloading), cycle(45.0)
     expected = 1e-3 * drive(law, PARTICLE, displacement, time=np.arange(len(displacement))).force
     side = half_contact(law, PARTICLE)
-    for force, overlaps in (
-        (functools.partial(WALL_PATH, side), 0.5e-6 * displacement),
-        (functools.partial(ON_PATH, side, side), 1e-6 * displacement),
-    ):
+    for force, overlaps in ((on_wall(side), 0.5e-6 * displacement), (on_pair(side, side), 1e-6 * displacement)):
         assert np.max(np.abs(driven(force, overlaps) - expected)) <= 1e-12 * np.max(expected)
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("variant", CLOSED, ids=named)
+@pytest.mark.parametrize("variant", CLOSED, ids=lambda v: v.label)
 def test_every_closed_effect_releases_as_the_law_does(variant):
     """From a peak under load control, which is in closed form: where the platen is at shares of the peak force."""
     law = law_of()._with((variant.build(variant.typical),))
@@ -94,7 +73,7 @@ def test_an_amplitude_of_zero_changes_nothing():
     overlaps = cycle(45.0) * UM
     plain, other = half_contact(law, PARTICLE), half_contact(law_of(C1=11.0), Particle(60.0, 62.0, 50.0))
     for partner in (plain, other):
-        without, again = (driven(functools.partial(ON_PATH, side, partner), overlaps) for side in (plain, none))
+        without, again = (driven(on_pair(side, partner), overlaps) for side in (plain, none))
         assert np.abs(again - without).max() <= 1e-12 * max(without)
     assert len(jax.tree.leaves(plain)) == 5  # a law without effects carries nothing of them
 
@@ -151,78 +130,17 @@ def test_what_would_gain_energy_is_refused_and_flagged():
     assert np.diff(energies).min() < 0  # it would have gained, indeed
 
 
-@pytest.mark.parametrize("unloading", list(Unloading))
-def test_energy_is_the_area_under_the_curve(unloading):
-    i = half_contact(with_all(unloading), PARTICLE)
-    j = half_contact(law_of(unloading, StrainScaling.CONTACT, C1=11.0), Particle(60.0, 62.0, 50.0))
-    overlaps = np.concatenate([np.linspace(0, 30e-6, 4001), np.linspace(30e-6, 28.5e-6, 4001)])
-    forces = np.asarray(driven(functools.partial(ON_PATH, i, j), overlaps))
-    work = np.sum(0.5 * (forces[1:] + forces[:-1]) * np.diff(overlaps))
-    energy = pair_energy(i, j, 30e-6, 28.5e-6)
-    np.testing.assert_allclose(energy.recoverable + energy.dissipated, work, rtol=2e-5)
-
-
-# ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
-def pair_of(unloading):
-    """Two unlike sides, and the force of their pair as a function of all their numbers, largest overlap and overlap."""
-    i = half_contact(with_all(unloading), PARTICLE)
-    j = half_contact(law_of(unloading, C1=11.0).with_effects("damage:stress"), Particle(60.0, 62.0, 50.0))
-    numbers, rebuild = jax.flatten_util.ravel_pytree((i, j))
-
-    def force(vector):
-        return pair_force(*rebuild(vector[:-2]), vector[-2], vector[-1])
-
-    return numbers, force
-
-
-@pytest.mark.extended
-@pytest.mark.parametrize("unloading", Unloading)
-@pytest.mark.parametrize(("peak", "share"), [(0.0, 25.0), (25.0, 0.999), (25.0, 0.99), (50.0, 0.985)])
-def test_derivatives_equal_differences(unloading, peak, share):
-    """T7: by every number of the sides, those of effects included, on loading and unloading, both modes."""
-    numbers, force = pair_of(unloading)
-    at = jnp.concatenate([numbers, UM * jnp.array([peak, share * peak if peak else share])])
-    force = jax.jit(force)
-    value = force(at)
-    assert value > 0
-    forward, reverse = jax.jit(jax.jacfwd(force))(at), jax.jit(jax.jacrev(force))(at)
-    np.testing.assert_allclose(forward * at, reverse * at, rtol=1e-10, atol=1e-12 * float(value))
-    assert (np.abs(forward * at) > 0).sum() >= (12 if peak else 6)
-    for k in range(len(at)):
-        h = 1e-5 * at[k]
-        if not h:
-            continue
-        f = [force(at.at[k].add(m * h)) for m in (1, -1, 2, -2)]
-        difference = (8 * (f[0] - f[1]) - (f[2] - f[3])) / (12 * h)
-        assert abs(forward[k] - difference) * abs(at[k]) <= 2e-6 * value, k
-
-
-@pytest.mark.extended
-@pytest.mark.parametrize("peak", [0.0, 1e-300, 1e-14, 1e-6, 25.0, 60.0])
-def test_finite_everywhere(peak):
-    numbers, force = pair_of(Unloading.PRINTED)
-    both = jax.jit(jax.vmap(jax.value_and_grad(force)))
-    share = jnp.array([-0.5, 0.0, 0.5, 0.98, 1.0, 1.2])
-    at = jnp.concatenate([jnp.tile(numbers, (6, 1)), UM * peak * jnp.stack([jnp.ones(6), share], axis=1)], axis=1)
-    value, gradient = both(at)
-    assert np.isfinite(value).all()
-    assert (value >= 0).all()
-    assert np.isfinite(gradient).all()
-
-
 # ---- machinery -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", OTHERS, ids=named)
+@pytest.mark.parametrize("variant", OTHERS, ids=lambda v: v.label)
 def test_everything_else_is_refused_by_name(variant):
     effect = variant.build(variant.typical)
-    remedy = r"of_particle\(\)" if effect.of_instrument else r"without_effects\(\"" + named(variant)
+    remedy = r"of_particle\(\)" if effect.of_instrument else r"without_effects\(\"" + variant.label
     law = law_of()._with((effect,))
-    with pytest.raises(InputError, match=f"half contact of a law with {named(variant)} is not known.*{remedy}"):
+    with pytest.raises(InputError, match=f"half contact of a law with {variant.label} is not known.*{remedy}"):
         half_contact(law, PARTICLE)
-    rest = law.of_particle() if effect.of_instrument else law.without_effects(named(variant))
+    rest = law.of_particle() if effect.of_instrument else law.without_effects(variant.label)
     assert eqx.tree_equal(half_contact(rest, PARTICLE), half_contact(law_of(), PARTICLE))
 
 

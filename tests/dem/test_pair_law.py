@@ -2,26 +2,17 @@
 
 import functools
 import itertools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from jax.flatten_util import ravel_pytree
 from two_scalars import bisected_path
 
 from mcc_jax import InputError, MccLaw, Particle, Plastic, Unloading
-from mcc_jax.dem import (
-    HalfContact,
-    half_contact,
-    pair_energy,
-    pair_force,
-    pair_split,
-    sides_of,
-    wall_energy,
-    wall_force,
-)
+from mcc_jax.dem import half_contact, pair_energy, pair_force, pair_split, sides_of, wall_energy, wall_force
 from mcc_jax.law import StrainScaling
 from mcc_jax.simulate import paper_population
 
@@ -34,6 +25,12 @@ PARTICLE = Particle(105.0, 92.0, 85.0)
 def law_of(unloading=Unloading.PRINTED, scaling=StrainScaling.RAW, C1=16.0, C3=3.4, C5=2.7, a=1.43, modulus=None):
     modulus = MODULUS[unloading] if modulus is None else modulus
     return MccLaw(Plastic(C1, C3, C5), a, modulus, unloading, scaling)
+
+
+def with_all(unloading, scaling=StrainScaling.CONTACT):
+    """A law with effects on parameters and on the modulus at the peak."""
+    at_peak = "damage:threshold", "densification_stiffening:heckel"
+    return law_of(unloading, scaling).with_effects(*at_peak, "size_effect:flow_and_modulus", "shape_second_order")
 
 
 def cycle(largest):
@@ -127,10 +124,7 @@ def test_small_overlaps_add_stiffness_in_series():
 @pytest.mark.parametrize("unloading", list(Unloading))
 def test_one_history_scalar_is_enough(unloading):
     """T4: the closed form against bisection with the two internal variables of each side."""
-    i = half_contact(law_of(unloading), PARTICLE)
-    j = half_contact(
-        law_of(unloading, C1=11.0, C3=3.0, C5=2.6, modulus=0.7 * MODULUS[unloading]), Particle(60.0, 62.0, 50.0)
-    )
+    i, j = pair(unloading)
     overlaps = cycle(34.0) * UM
     force = driven(on_pair(i, j), overlaps)
     expected = bisected_path(i, j, overlaps)
@@ -166,66 +160,75 @@ def test_ellipsoid_turns_continuously():
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def summed(vector):
-    """Force of one pair from a vector: both sides' numbers, largest overlap, overlap."""
-    i = HalfContact(vector[0], vector[1], vector[2], vector[3], jnp.ones(()))
-    j = HalfContact(vector[4], vector[5], vector[6], vector[7], jnp.ones(()))
-    return pair_force(i, j, vector[8], vector[9])
-
-
-SUMMED = jax.jit(summed)
-JACOBIANS = jax.jit(lambda at: (jax.jacfwd(summed)(at), jax.jacrev(summed)(at)))
-VALUE_AND_GRADIENT = jax.jit(jax.value_and_grad(summed))
+def pair(unloading=Unloading.PRINTED, effects=False):
+    """Two unlike sides, with effects on parameters and modulus or without."""
+    other = Particle(60.0, 62.0, 50.0)
+    if effects:
+        j = law_of(unloading, C1=11.0).with_effects("damage:stress")
+        return half_contact(with_all(unloading), PARTICLE), half_contact(j, other)
+    softer = law_of(unloading, C1=11.0, C3=3.0, C5=2.6, modulus=0.75 * MODULUS[unloading])
+    return half_contact(law_of(unloading), PARTICLE), half_contact(softer, other)
 
 
 @functools.cache
-def two_sides():
-    """The numbers of two unlike sides."""
-    i = half_contact(law_of(), PARTICLE)
-    j = half_contact(law_of(C1=11.0, C3=3.0, C5=2.6, modulus=12000.0), Particle(60.0, 62.0, 50.0))
-    return [float(k) for k in (i.k1, i.k3, i.k5, i.c, j.k1, j.k3, j.k5, j.c)]
+def compiled(unloading, effects):
+    """Force of a pair, and its derivatives, by a vector of both sides' numbers, largest overlap and overlap."""
+    _, sides = ravel_pytree(pair(unloading, effects))
+
+    def force(vector):
+        return pair_force(*sides(vector[:-2]), vector[-2], vector[-1])
+
+    return jax.jit(force), jax.jit(jax.jacfwd(force)), jax.jit(jax.jacrev(force))
 
 
-def vector_of(peak, overlap):
-    return jnp.asarray([*two_sides(), peak * UM, overlap * UM])
+def vector_of(sides, peak, overlap):
+    return jnp.concatenate([ravel_pytree(sides)[0], UM * jnp.array([peak, overlap])])
+
+
+PLAIN = [
+    *((1, 1, *at) for at in ((0.0, 8.0), (0.0, 25.0), (25.0, 24.9), (25.0, 24.0), (30.0, 29.5), (0.05, 0.03))),
+    *((1e4, 1e4, *at) for at in ((2.0, 1.5), (60.0, 55.0))),
+    *((1e4, 1, *at) for at in ((60.0, 58.0), (2.0, 1.8))),
+]
+WITH_EFFECTS = [(1, 1, *at) for at in ((0.0, 25.0), (25.0, 24.975), (25.0, 24.75), (50.0, 49.25))]
 
 
 @pytest.mark.extended
 @pytest.mark.parametrize(
-    ("soft_i", "soft_j", "peak", "overlap"),
-    [
-        *((1, 1, *at) for at in ((0.0, 8.0), (0.0, 25.0), (25.0, 24.9), (25.0, 24.0), (30.0, 29.5), (0.05, 0.03))),
-        *((1e4, 1e4, *at) for at in ((2.0, 1.5), (60.0, 55.0))),
-        *((1e4, 1, *at) for at in ((60.0, 58.0), (2.0, 1.8))),
-    ],
+    ("unloading", "effects", "soft_i", "soft_j", "peak", "overlap"),
+    [*((Unloading.PRINTED, False, *at) for at in PLAIN), *((u, True, *at) for u in Unloading for at in WITH_EFFECTS)],
 )
-def test_derivatives_equal_differences(soft_i, soft_j, peak, overlap):
+def test_derivatives_equal_differences(unloading, effects, soft_i, soft_j, peak, overlap):
     """T7: every parameter, on loading and unloading, both modes; sides limited by their peak or by their slope."""
-    at = vector_of(peak, overlap) * jnp.asarray([1.0, 1, 1, soft_i, 1, 1, 1, soft_j, 1, 1])
-    value = SUMMED(at)
+    i, j = pair(unloading, effects)
+    at = vector_of((replace(i, c=soft_i * i.c), replace(j, c=soft_j * j.c)), peak, overlap)
+    force, by_forward, by_reverse = compiled(unloading, effects)
+    value, forward, reverse = float(force(at)), by_forward(at), by_reverse(at)
     assert value > 0
-    forward, reverse = JACOBIANS(at)
-    if limited := soft_i > 1 or 0 < peak < 1:
-        np.testing.assert_allclose(forward * at, reverse * at, rtol=1e-11, atol=1e-12 * float(value))
-    else:
-        np.testing.assert_allclose(forward, reverse, rtol=1e-12)
-    if peak:  # a side at its limit no longer feels its modulus
+    limited = soft_i > 1 or 0 < peak < 1
+    rtol, atol = (1e-10, 1e-12 * value) if effects else (1e-11, 1e-12 * value) if limited else (1e-12, 0)
+    np.testing.assert_allclose(forward * at, reverse * at, rtol=rtol, atol=atol)
+    if effects:
+        assert (np.abs(forward * at) > 0).sum() >= (12 if peak else 6)
+    elif peak:  # a side at its limit no longer feels its modulus
         assert (forward[3] == 0) == limited
     for k in np.flatnonzero(at):
         step = 1e-5 * at[k]
-        f = [SUMMED(at.at[k].add(m * step)) for m in (1, -1, 2, -2)]
+        f = [force(at.at[k].add(m * step)) for m in (1, -1, 2, -2)]
         difference = (8 * (f[0] - f[1]) - (f[2] - f[3])) / (12 * step)
-        assert abs(forward[k] - difference) * at[k] <= 1e-6 * value, k
+        assert abs(forward[k] - difference) * abs(at[k]) <= (2e-6 if effects else 1e-6) * value, k
     assert not forward[np.asarray(at) == 0].any()
 
 
-@settings(max_examples=60, deadline=None)
-@given(peak=st.sampled_from([0.0, 1e-300, 1e-14, 1e-6, 1.0, 25.0, 60.0]), share=st.floats(-0.5, 1.2))
-def test_finite_everywhere(peak, share):
-    at = vector_of(peak, share * peak)
-    value, gradient = VALUE_AND_GRADIENT(at)
-    assert np.isfinite(value)
-    assert value >= 0
+@pytest.mark.parametrize("effects", [False, True])
+def test_finite_everywhere(effects):
+    sides, shares = pair(effects=effects), np.append(np.linspace(-0.5, 1.2, 18), [0.98, 1.0])
+    peaks = (0.0, 1e-300, 1e-14, 1e-6, 1.0, 25.0, 60.0)
+    at = jnp.stack([vector_of(sides, peak, share * peak) for peak in peaks for share in shares])
+    force, _, by_reverse = compiled(Unloading.PRINTED, effects)
+    value, gradient = jax.vmap(force)(at), jax.vmap(by_reverse)(at)
+    assert np.all(np.isfinite(value))
+    assert np.all(value >= 0)
     assert np.all(np.isfinite(gradient))
 
 
@@ -266,10 +269,10 @@ def test_compiled_split_converges(spread_of_sizes):
 # ---- energy ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("effects", [False, True])
 @pytest.mark.parametrize("unloading", list(Unloading))
-def test_energy_is_the_area_under_the_curve(unloading):
-    i = half_contact(law_of(unloading), PARTICLE)
-    j = half_contact(law_of(unloading, C1=11.0, C3=3.0, C5=2.6), Particle(60.0, 62.0, 50.0))
+def test_energy_is_the_area_under_the_curve(unloading, effects):
+    i, j = pair(unloading, effects)
     overlaps = np.concatenate([np.linspace(0, 30e-6, 4001), np.linspace(30e-6, 28e-6, 4001)])
     for force, energy in (
         (on_pair(i, j), pair_energy(i, j, jnp.asarray(30e-6), jnp.asarray(28e-6))),

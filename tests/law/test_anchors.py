@@ -142,19 +142,6 @@ def test_derivatives_at_zero(mode, form):
     np.testing.assert_array_equal(mode(virgin)(jnp.array(-0.1)), 0)
 
 
-def test_approach_to_full_release():
-    """sigma -> sigma_P 1.20042175488 ((eps - eps_f)/delta)^1.5, a contact that opens with zero slope."""
-    law, p = PITFALL
-    end = 0.45 - DELTA
-    ratio = stress_at(jnp.array(end + 1e-4 * DELTA)) / 7.079815256080347
-    close(ratio, 1.20042175488 * 1e-6, rel=3e-5)
-    close(
-        law.residual_displacement(p, History(p.displacement(jnp.array(0.45)))),
-        p.displacement(jnp.array(end)),
-        rel=1e-14,
-    )
-
-
 # ---- tests by number ------------------------------------------------------------------------------------------------
 
 

@@ -32,28 +32,6 @@ def test_a_frame_adds_compliance_times_force_and_nothing_else():
     close(frame - base, COMPLIANCE * FORCE, rel=1e-12, scale=1e-12 * float(base.max()))
 
 
-@pytest.mark.extended
-def test_creep_is_the_solution_of_its_equation_by_hand():
-    r"""Kelvin-Voigt: tau y' + y = sigma. On the ramp sigma = r t, in the hold exponentially towards the peak."""
-    law = LAW.with_effects(LIBRARY["creep"]["kelvin_voigt"].build(RATE, tau_s=TAU))
-    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
-    added = np.asarray(drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement - base)
-    time, stress = np.asarray(TIME), np.asarray(PARTICLE.stress(FORCE))
-    rate = stress[60] / time[60]
-    ramp = rate * (time - TAU * -np.expm1(-time / TAU))
-    hold = stress[60] + (ramp[60] - stress[60]) * np.exp(-(time - time[60]) / TAU)
-    by_hand = float(PARTICLE.effective_diameter) * RATE * np.where(time <= time[60], ramp, hold)
-    np.testing.assert_allclose(added[:181], by_hand[:181], rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.extended
-def test_amplitude_zero_is_the_base_law():
-    null = creeping(0.0, 0.0).with_effects(*(v.build(0.0) for m in LIBRARY.values() for v in list(m)[:1]))
-    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
-    found = drive(null, PARTICLE, FORCE, time=TIME, control="load").displacement
-    np.testing.assert_allclose(found, base, rtol=1e-12)
-
-
 def test_a_law_without_effects_is_the_base_law_to_the_last_bit():
     emptied = creeping().of_particle().with_effects()
     assert [effect.name for effect in emptied.effects] == ["creep:logarithmic"]
@@ -62,19 +40,6 @@ def test_a_law_without_effects_is_the_base_law_to_the_last_bit():
         drive(none, PARTICLE, FORCE, control="load").displacement,
         drive(LAW, PARTICLE, FORCE, control="load").displacement,
     )
-
-
-@pytest.mark.extended
-def test_displacement_control_is_the_inverse_and_has_its_derivatives():
-    law = creeping()
-    path = drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement
-    np.testing.assert_allclose(drive(law, PARTICLE, path, time=TIME).force, FORCE, atol=1e-8)
-
-    def force(compliance):
-        return drive(creeping(compliance=compliance), PARTICLE, path, time=TIME).force[40]
-
-    slope, h = jax.grad(force)(COMPLIANCE), 1e-6
-    close(slope, (force(COMPLIANCE + h) - force(COMPLIANCE - h)) / (2 * h), rel=1e-5)
 
 
 @pytest.mark.extended

@@ -29,9 +29,6 @@ def test_constants():
     check(PUNCH.constant, "4.1212954341986")
     check(PUNCH.constant, "4.12")
     check(EXACT.constant, "5.72", rel=1e-15)
-    # The same for h = gamma/2 at each of two contacts.
-    check(PUNCH.constant / 8, "0.515161929275")
-    check(EXACT.constant / 8, "0.715", rel=1e-15)
     assert [s.power for s in StrainScaling] == [0, 1, 3]
 
 
@@ -60,33 +57,24 @@ def test_constants_follow_from_the_pressure_under_the_punch(q, printed):
 
 
 @pytest.mark.parametrize(
-    ("stress", "strain", "printed", "punch", "exact", "punch_shared", "exact_shared", "moduli"),
+    ("stress", "strain", "printed", "punch", "exact", "moduli"),
     [
-        (7, "0.5583534621", "0.01379068422", "2.884075178e-4", "2.448079044e-4", "8.157396462e-4", "6.924213172e-4",
-         ("334.61", "284.03", "803.35")),
-        (10, "0.6063483028", "0.01581722591", "3.953684956e-4", "3.355992022e-4", "1.118270977e-3", "9.492178867e-4",
-         ("399.94", "339.48", "960.19")),
-        (12, "0.6309065370", "0.01698632816", "4.651166386e-4", "3.948032648e-4", "1.315548517e-3", "1.116672263e-3",
-         ("438.11", "371.88", "1051.8")),
-        (16, "0.6701912120", "0.01903058013", "6.017051957e-4", "5.107432330e-4", "1.701879297e-3", "1.444600014e-3",
-         ("505.88", "429.41", "1214.6")),
+        (7.0, "0.5583534621", "0.01379068422", "2.884075178e-4", "2.448079044e-4", ("334.61", "284.03")),
+        (10.0, "0.6063483028", "0.01581722591", "3.953684956e-4", "3.355992022e-4", ("399.94", "339.48")),
+        (12.0, "0.6309065370", "0.01698632816", "4.651166386e-4", "3.948032648e-4", ("438.11", "371.88")),
+        (16.0, "0.6701912120", "0.01903058013", "6.017051957e-4", "5.107432330e-4", ("505.88", "429.41")),
     ],
-)  # fmt: skip
-def test_recovered_strain_of_a_sphere(stress, strain, printed, punch, exact, punch_shared, exact_shared, moduli):
-    check(paper_law().plastic.strain(jnp.array(float(stress))), strain)
-    by_form = {form: recovered(paper_law(form), sphere(), float(stress)) for form in Unloading}
-    check(by_form[PRINTED], printed)
-    check(by_form[PUNCH], punch)
-    check(by_form[EXACT], exact)
-    check(by_form[PUNCH] * np.sqrt(8), punch_shared)
-    check(by_form[EXACT] * np.sqrt(8), exact_shared)
+)
+def test_recovered_strain_of_a_sphere(stress, strain, printed, punch, exact, moduli):
+    check(paper_law().plastic.strain(jnp.array(stress)), strain)
+    by_form = {form: recovered(paper_law(form), sphere(), stress) for form in Unloading}
+    for form, text in zip(Unloading, (printed, punch, exact), strict=True):
+        check(by_form[form], text)
     # The modulus with which a punch form recovers what the printed one recovers at 16 GPa.
-    for form, shared, modulus in ((PUNCH, 1, moduli[0]), (EXACT, 1, moduli[1]), (EXACT, np.sqrt(8), moduli[2])):
-        equivalent = float(EBAR * shared * by_form[form] / by_form[PRINTED])
+    for form, modulus in zip((PUNCH, EXACT), moduli, strict=True):
+        equivalent = float(EBAR * by_form[form] / by_form[PRINTED])
         check(equivalent, modulus)
-        # Sharing the displacement is k/8, which is a modulus sqrt(8) times as large.
-        again = recovered(paper_law(form, modulus=equivalent / shared), sphere(), float(stress))
-        close(again, by_form[PRINTED], rel=1e-13)
+        close(recovered(paper_law(form, modulus=equivalent), sphere(), stress), by_form[PRINTED], rel=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -207,14 +195,6 @@ def test_printed_form_fails_at_small_strain(eta, printed):
         close(law.recoverable_strain(p, jnp.array(strain)), np.float64(strain), rel=1e-15)
         assert law.recoverable_strain(p, jnp.array(strain)) < as_printed(law, p, jnp.array(strain))
         assert energy_at_full_release(law, p, jnp.array(strain)).dissipated > 0
-
-
-@pytest.mark.parametrize("number", range(1, 21))
-@pytest.mark.parametrize("strain", [1e-9, 1e-3, 0.0151, 0.05, 0.4, 1.0])
-def test_dissipation_is_positive(number, strain):
-    p = paper_particle(number)
-    for form in Unloading:
-        assert energy_at_full_release(paper_law(form), p, jnp.array(strain)).dissipated > 0
 
 
 @pytest.mark.parametrize("form", Unloading)
