@@ -20,6 +20,8 @@ from ..effects.record import first_point
 from ..formulas import Contact, Formulas, first_gain
 from ..geometry import Particle
 from .response import (
+    Memory,
+    additions,
     context_along,
     describe,
     factor_at_peak,
@@ -28,7 +30,6 @@ from .response import (
     given_effects,
     initial_memory,
     peak_forces,
-    respond,
 )
 
 TESTED_STRAIN = 0.67
@@ -278,8 +279,13 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         return context_along(self, self.effects, particle, zero, record, peak_forces(record, zero))
 
     def _along(self, particle: Particle, state: History, record: Record) -> tuple[History, Path]:
-        peak, memory, displacement = respond(self, self.effects, particle, state.displacement_max, state.memory, record)
-        return History(peak, memory), displacement
+        """The history and the displacements [um] after the points of a record, with effects."""
+        highest = peak_forces(record, state.memory.peak_force)
+        context = context_along(self, self.effects, particle, state.displacement_max, record, highest)
+        own, drivers, added = additions(self.effects, state.memory, context)
+        last = record, highest, context.peak_displacement
+        point, peak_force, peak = jax.tree.map(lambda x: x[-1] if x.ndim else x, last)
+        return History(peak, Memory(point, peak_force, own, drivers)), context.displacement + added
 
     # ---- energy ------------------------------------------------------------------------------------------------------
 

@@ -81,18 +81,6 @@ def initial_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | N
 # ---- along a path ----------------------------------------------------------------------------------------------------
 
 
-def respond(
-    law: Formulas, effects: Effects, particle: Particle, displacement_max: Scalar, memory: Memory, record: Record
-) -> tuple[Scalar, Memory, Path]:
-    """Largest displacement of the law [um], memory and displacements [um] after the points of a record."""
-    highest = peak_forces(record, memory.peak_force)
-    context = context_along(law, effects, particle, displacement_max, record, highest)
-    own, drivers, added = additions(effects, memory, context)
-    last = record, highest, context.peak_displacement
-    point, peak_force, displacement_max = jax.tree.map(lambda x: x[-1] if x.ndim else x, last)
-    return displacement_max, Memory(point, peak_force, own, drivers), context.displacement + added
-
-
 def peak_forces(record: Record, before: Scalar) -> Path:
     """Force from which the branch of every point starts [mN]: the record's own peaks, else the largest so far."""
     highest = running_max(record.force) if record.peak is None else record.peak

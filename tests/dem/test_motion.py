@@ -76,19 +76,6 @@ def test_pairs_conserve_momentum_and_angular_momentum():
     assert np.abs(moment).max() <= 1e-12 * size * len(state.position)
 
 
-@pytest.mark.extended
-def test_no_damping_no_friction_no_torque_and_energy_only_lost():
-    """Without damping and friction what is missing is what the law dissipates."""
-    plain = Motion.of(float(motion().time_step) / 4)
-    state = stirred(dense())
-    state = eqx.tree_at(lambda s: s.spin, state, jnp.zeros_like(state.spin))
-    _, forces = STEP(packing(), plain, state)
-    assert np.abs(forces.torque).max() == 0
-    end, rows = advance(packing(), plain, state, REST, 6, 25, SKIN)
-    assert np.all(np.isfinite(end.position))
-    assert rows.kinetic[-1] < 0.5 * jnp.sum(packing().mass * jnp.sum(state.velocity**2, axis=1)) + 1e-6
-
-
 def two_spheres(friction, normal_overlap=4e-6):
     pack = spheres(paper_law(), jnp.asarray([100.0, 100.0]))
     position = jnp.asarray([[0.0, 0.0, 0.0], [100e-6 - normal_overlap, 0.0, 0.0]])

@@ -101,19 +101,6 @@ def test_loading_inverse_meets_the_force(unloading, scaling):
     close(force_along(law, p, d), force, rel=1e-14)
 
 
-def test_eager_is_jitted():
-    law, p = paper_law(), paper_particle(1)
-    path = jnp.array([0.0, 40.0, 80.0, 79.5, 79.0, 0.0, 100.0, -3.0])
-    eager = law.path(p, law.init(p), path)[1]
-    jitted = force_along(law, p, path)
-    close(eager, jitted, scale=1e-13 * float(eager.max()))
-    state, forces = law.init(p), []
-    for d in path:
-        state, force = law.step(p, state, d)
-        forces.append(force)
-    close(jnp.stack(forces), eager, scale=1e-13 * float(eager.max()))
-
-
 def test_vmap_is_the_loop():
     """Over laws, particles and paths at once."""
     rng = np.random.default_rng(5)
@@ -151,30 +138,6 @@ def test_new_numbers_do_not_recompile():
         run(law, Particle(200.0 * factor, 190.0, 160.0), History(3.0 * factor), factor * path)
 
 
-def test_history_is_what_was_reached():
-    law, p = paper_law(), paper_particle(1)
-    assert law.init(p).displacement_max == 0
-    for path in ([10.0, 30.0, 20.0], [-1.0, -2.0], [5.0]):
-        state, _ = law.path(p, History(7.0), jnp.array(path))
-        assert state.displacement_max == max(7.0, *path)
-    state, force = law.step(p, History(7.0), jnp.array(3.0))
-    assert state.displacement_max == 7
-    assert force == 0
-
-
-@pytest.mark.extended
-def test_splitting_a_path_changes_nothing():
-    law, p = paper_law(), paper_particle(7)
-    path = jnp.array([10.0, 40.0, 39.5, 39.0, 39.8, 60.0, 59.0, 62.0])
-    state, whole = law.path(p, law.init(p), path)
-    middle, first = law.path(p, law.init(p), path[:4])
-    end, second = law.path(p, middle, path[4:])
-    close(jnp.concatenate([first, second]), whole, scale=1e-13 * float(whole.max()))
-    assert end.displacement_max == state.displacement_max
-    state, whole = law.path_load(p, law.init(p), whole)
-    assert jnp.all(jnp.diff(whole[jnp.array([0, 1, 5, 7])]) > 0)
-
-
 @pytest.mark.extended
 @pytest.mark.parametrize("number", [1, 6, 12, 16, 20])
 def test_single_precision(number):
@@ -197,24 +160,6 @@ def test_single_precision(number):
     close(force, exact, scale=3e-6 * float(peak[-1]))
     loaded = np.asarray(force) > 1e-3 * peak
     close(displacement[loaded], path[loaded], scale=2e-6 * float(path.max()))
-
-
-@pytest.mark.extended
-@ALL_FORMS
-def test_every_form_runs_in_single_precision(unloading, scaling):
-    law, p = (with_dtype(t, jnp.float32) for t in (paper_law(unloading, scaling, modulus=1000.0), paper_particle(5)))
-    path = jnp.concatenate([jnp.linspace(0, 120, 50), jnp.linspace(120, 90, 50)]).astype(jnp.float32)
-
-    @jax.jit
-    def everything(law, p, path):
-        state, force = law.path(p, law.init(p), path)
-        _, displacement = law.path_load(p, law.init(p), force)
-        work = law.energy(p, state, path[-1]).work
-        return state.displacement_max, force, displacement, work, law.recoverable_strain(p, path[:3] / 250)
-
-    for value in everything(law, p, path):
-        assert value.dtype == jnp.float32
-        assert jnp.all(jnp.isfinite(value))
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)

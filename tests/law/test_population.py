@@ -5,9 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import K1, check, close, paper_population
-from scipy.stats import norm
 
-from mcc_jax.campaign.paper import PAPER_LOG_C
 from mcc_jax.law import LogNormal, PlasticPopulation
 
 POPULATION = paper_population()
@@ -45,12 +43,9 @@ def test_medians():
 
 
 def test_yield_stress():
-    """17.16 sigma_y = C1: 0.4085 MPa."""
-    prefactor = 12 * 1.43  # stress over yield stress and strain of an ideally plastic sphere, eq. 22
-    check(K1 / prefactor, "0.40847319347")
+    """C1 / (12 c^2), stress over yield stress and strain of an ideally plastic sphere (eq. 22)."""
     check(POPULATION.yield_stress, "0.4085")
-    close(POPULATION.yield_stress, 0.40847319347, rel=2e-6)
-    check(POPULATION.median_law.C1 / prefactor, "0.39067428609")
+    close(POPULATION.yield_stress, K1 / (12 * 1.43), rel=2e-6)
 
 
 def test_moments():
@@ -79,15 +74,7 @@ def test_mean_spread_and_median_curve(x, mean, sd, median):
 
 
 def test_probability_of_a_curve_that_falls():
-    mu, tau = zip(*(PAPER_LOG_C[c] for c in ("C1", "C3", "C5")), strict=True)
-    gap = np.log(20 / 9) + mu[0] + 5 * mu[2] - 6 * mu[1]
-    spread = np.sqrt(tau[0] ** 2 + 25 * tau[2] ** 2 + 36 * tau[1] ** 2)
-    check(gap, "0.984207696218")
-    check(spread, "0.49790009038")
-    check(gap / spread, "1.97671724757")
     check(POPULATION.probability_not_monotone, "0.0240368000563", rel=1e-10)
-    check(1 - (1 - POPULATION.probability_not_monotone) ** 20, "0.38529203")
-    close(POPULATION.probability_not_monotone, norm.cdf(-gap / spread), rel=1e-12)
 
 
 def test_probability_against_draws(draws, kept):
