@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from .._numerics import recompute
@@ -202,80 +201,57 @@ def _work(stored) -> Scalar:
 # ---- the minimum -----------------------------------------------------------------------------------------------------
 
 
-class _State(eqx.Module):
+class _Search(NamedTuple):
+    """Centres to try next, centres taken last, the balance there, and the step from the one to the other."""
+
     trial: Vectors
+    position: Vectors
+    at: Balance
     direction: Vectors
     size: Scalar
-    energy: Scalar
-    slope: Scalar
-    first: Flag
+    steps: Int[Array, ""]
     converged: Flag
     stuck: Flag
-    at: Balance
 
 
-class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
-    """Newton's method on the energy of a packing, with a line search, as a minimiser of Optimistix.
+def _minimum(problem: Problem, guess: Vectors, rtol: Scalar | float, max_steps: int) -> _Search:
+    """Newton's method on the energy of a packing, with a line search.
 
     Contacts stiffen thirty times and more where they turn from loading to unloading, so that the net force has kinks.
     It is minus the gradient of an energy, which has none and so judges a step. Where the stiffness is not positive
     definite (forces that turn destabilise) its material part, which always is, gives the direction.
-
-    The largest net force may be `rtol` times the mean contact force, plus `atol` [N]; a particle moves at most by
-    `reach` [m] in one step.
     """
+    sides, radius = problem.packing.sides, problem.packing.radius
+    atol, reach = 1e-12 * jnp.mean(sides.k1 * radius), 0.3 * jnp.min(radius)  # [N], most a particle moves in a step [m]
 
-    rtol: Scalar | float  # pyright: ignore[reportIncompatibleVariableOverride]
-    atol: Scalar  # pyright: ignore[reportIncompatibleVariableOverride]
-    reach: Scalar
-
-    def norm(self, y: Any) -> Scalar:
-        """The largest absolute entry; an attribute that Optimistix asks for."""
-        return jnp.max(jnp.abs(y))
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """Nothing is known yet: the first step evaluates the start."""
-        zero, no = jnp.zeros((), f_struct.dtype), jnp.array(False)
-        at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
-        return _State(y, jnp.zeros_like(y), zero + 1, zero, zero, jnp.array(True), no, no, at)
-
-    def step(self, fn, y, args, options, state: _State, tags) -> tuple[Vectors, _State, Balance]:
+    def step(search: _Search) -> _Search:
         """Evaluate the trial; take it and find a new direction, or shorten the step."""
-        energy, at = fn(state.trial, args)
+        at = balance(problem, search.trial)
         largest = jnp.max(jnp.abs(at.net))
-        slope_there = -jnp.sum(at.net * state.direction)
-        descends = energy - state.energy <= SUFFICIENT * state.size * state.slope
+        slope, slope_there = (-jnp.sum(that.net * search.direction) for that in (search.at, at))
+        change = at.energy - search.at.energy
+        descends = change <= SUFFICIENT * search.size * slope
         # Close to the minimum the energy has no digits left to judge a step by; its slope has.
-        level = jnp.abs(energy - state.energy) <= 1e-12 * jnp.abs(state.energy)
-        accept = state.first | descends | (level & (jnp.abs(slope_there) <= 0.9 * jnp.abs(state.slope)))
-        converged = accept & (largest <= self.rtol * at.scale + self.atol)
+        level = jnp.abs(change) <= 1e-12 * jnp.abs(search.at.energy)
+        accept = (search.steps == 0) | descends | (level & (jnp.abs(slope_there) <= 0.9 * jnp.abs(slope)))
+        converged = accept & (largest <= rtol * at.scale + atol)
         direction = jax.lax.cond(
-            accept & ~converged, lambda: _direction(at, self.reach), lambda: jnp.where(converged, 0.0, state.direction)
+            accept & ~converged, lambda: _direction(at, reach), lambda: jnp.where(converged, 0.0, search.direction)
         )
-        secant = state.slope / jnp.minimum(state.slope - slope_there, -jnp.finfo(energy.dtype).tiny)
-        size = jnp.where(accept, 1.0, state.size * jnp.clip(secant, 0.1, 0.5))
-        y = jnp.where(accept, state.trial, y)
-        new = _State(
-            y + size * direction,
-            direction,
-            size,
-            jnp.where(accept, energy, state.energy),
-            jnp.where(accept, -jnp.sum(at.net * direction), state.slope),
-            jnp.array(False),
-            converged,
-            ~accept & (size < 1e-10) | ~jnp.isfinite(largest),
-            jax.tree.map(lambda now, before: jnp.where(accept, now, before), at, state.at),
-        )
-        return y, new, state.at
+        secant = slope / jnp.minimum(slope - slope_there, -jnp.finfo(at.energy.dtype).tiny)
+        size = jnp.where(accept, 1.0, search.size * jnp.clip(secant, 0.1, 0.5))
+        position = jnp.where(accept, search.trial, search.position)
+        stuck = ~accept & (size < 1e-10) | ~jnp.isfinite(largest)
+        at = jax.tree.map(lambda now, before: jnp.where(accept, now, before), at, search.at)
+        return _Search(position + size * direction, position, at, direction, size, search.steps + 1, converged, stuck)
 
-    def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Flag, optx.RESULTS]:
-        """Whether the net force is small enough, or no step helps any more."""
-        result = optx.RESULTS.where(state.stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
-        return state.converged | state.stuck, result
+    def goes_on(search: _Search) -> Flag:
+        return ~(search.converged | search.stuck) & (search.steps < max_steps)
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Vectors, Balance, dict[str, Any]]:
-        """The balance is that of the centres returned, also where the last trial was not taken."""
-        return y, state.at, {}
+    unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(balance, problem, guess))
+    one, no = jnp.ones((), guess.dtype), jnp.array(False)
+    start = _Search(guess, guess, unknown, jnp.zeros_like(guess), one, jnp.array(0), no, no)
+    return jax.lax.while_loop(goes_on, step, start)
 
 
 def _direction(at: Balance, reach: Scalar) -> Vectors:
@@ -302,21 +278,9 @@ def find_equilibrium(problem: Problem, guess: Vectors, rtol: Scalar | float, max
     Differentiable in `problem` in both modes; a load step that did not converge returns where it got to. `rtol` is the
     largest net force over the mean contact force, `max_steps` are evaluations.
     """
-    fixed = jax.lax.stop_gradient(problem)
-    sides, radius = fixed.packing.sides, fixed.packing.radius
-    atol, reach = 1e-12 * jnp.mean(sides.k1 * radius), 0.3 * jnp.min(radius)
-    solver = ContactNewton(rtol, atol, reach)  # pyright: ignore[reportCallIssue]  # `norm` is a method here
-
-    def energy(position: Vectors, problem: Problem) -> tuple[Scalar, Balance]:
-        at = balance(problem, position)
-        return at.energy, at
-
-    found = optx.minimise(
-        energy, solver, jax.lax.stop_gradient(guess), fixed, has_aux=True, max_steps=max_steps, throw=False
-    )
-    at = found.aux
-    position = _implicit(found.value, at.stiffness, forces(problem, found.value)[0])
-    return Equilibrium(position, at, found.result == optx.RESULTS.successful, found.stats["num_steps"])
+    found = _minimum(*jax.lax.stop_gradient((problem, guess)), rtol, max_steps)
+    position = _implicit(found.position, found.at.stiffness, forces(problem, found.position)[0])
+    return Equilibrium(position, found.at, found.converged, found.steps)
 
 
 @eqx.filter_custom_jvp
