@@ -33,7 +33,9 @@ ROUNDING = 1e-13
 
 @eqx.filter_jit
 def along(law, particle, peak, displacements):
-    return jax.vmap(lambda d: law.energy(particle, History(peak), d))(displacements)
+    """Energies at displacements, each with a peak of its own or one for all."""
+    peaks = jnp.broadcast_to(peak, displacements.shape)
+    return jax.vmap(lambda peak, d: law.energy(particle, History(peak), d))(peaks, displacements)
 
 
 @pytest.mark.extended
@@ -145,7 +147,7 @@ def test_no_work_where_the_quintic_would_pull(C3):
     F = np.asarray(force_along(law, p, path))
     work = np.concatenate([[0.0], np.cumsum(0.5 * (F[1:] + F[:-1])) * float(path[1])])
     peaks = path[::4000]
-    found = along_peaks(law, p, peaks)
+    found = along(law, p, peaks, peaks)
     close(found.work, work[::4000], rel=1e-6, scale=1e-12)
     assert jnp.all(jnp.diff(found.dissipated) >= -1e-12)
     slopes = jax.vmap(jax.grad(lambda d: law.contact(p).work(d)))(peaks)
@@ -158,11 +160,6 @@ def test_no_work_where_the_quintic_would_pull(C3):
             up[k] - down[k]
         )
         close(exact[k], slope, rel=2e-5)
-
-
-@eqx.filter_jit
-def along_peaks(law, particle, peaks):
-    return jax.vmap(lambda d: law.energy(particle, History(d), d))(peaks)
 
 
 # ---- the limit of recovery -------------------------------------------------------------------------------------------

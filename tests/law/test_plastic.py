@@ -32,14 +32,7 @@ MEAN = Plastic.from_polynomial(K1, K3, K5)
 VIOLATING = Plastic(4.0, 3.0, 2.4)
 
 
-@eqx.filter_jit
-def tangent(plastic, x):
-    return plastic.tangent(x)
-
-
-@eqx.filter_jit
-def work(plastic, x):
-    return plastic.curve.work(x)
+tangent = eqx.filter_jit(Plastic.tangent)
 
 
 @pytest.mark.parametrize(
@@ -217,23 +210,13 @@ def test_work_is_the_integral_of_stress():
         nodes, weights = np.polynomial.legendre.leggauss(5)
         points = jnp.asarray(x / 2 * (nodes + 1))
         area = x / 2 * np.sum(weights * np.asarray(master_stress(MEAN, points)))
-        close(work(MEAN, jnp.array(x)), area, scale=1e-14)
+        close(MEAN.curve.work(jnp.array(x)), area, scale=1e-14)
     close(jax.grad(MEAN.curve.work)(jnp.array(0.4)), master_stress(MEAN, jnp.array(0.4)), rel=1e-14)
 
 
 # ---- laws whose loading curve falls somewhere: 2.4 % of the paper's population ---------------------------------------
 
 FALLING = between(1.01, 3.0)  # 9 C3^6 / (20 C1 C5^5); above 1.8 the bare quintic is tensile
-
-
-@eqx.filter_jit
-def under_displacement(law, p, state, path):
-    return law.path(p, state, path)
-
-
-@eqx.filter_jit
-def under_load(law, p, state, path):
-    return law.path_load(p, state, path)
 
 
 def envelope(plastic, targets, end):
@@ -275,8 +258,8 @@ def test_forces_are_met_under_load_control(theta, fractions):
     K1, K3, K5 = (float(k) for k in law.plastic.polynomial)
     peak = np.sqrt((3 * K3 - np.sqrt(9 * K3**2 - 20 * K1 * K5)) / (10 * K5))
     force = p.force(master_stress(law.plastic, jnp.array(peak))) * jnp.asarray(fractions)
-    _, d = under_load(law, p, law.init(p), force)
-    _, back = under_displacement(law, p, law.init(p), d)
+    _, d = law.path_load(p, law.init(p), force)
+    _, back = law.path(p, law.init(p), d)
     close(back, force, rel=1e-6, scale=1e-9 * float(force.max()))
     highest = np.maximum.accumulate(np.asarray(force))
     peaks = np.maximum.accumulate(np.asarray(d))
@@ -293,14 +276,14 @@ def test_behind_the_peak_there_is_no_way_back():
     at = float(law.step(p, state, state.displacement_max)[1])
     top = float(p.force(VIOLATING.stress(jnp.array(0.290470885402))))
     assert at < top
-    _, d = under_load(law, p, state, jnp.array([at * (1 + 1e-9), (at + top) / 2, 1.01 * top]))
+    _, d = law.path_load(p, state, jnp.array([at * (1 + 1e-9), (at + top) / 2, 1.01 * top]))
     x = np.asarray(d) / scale
     assert np.all(x > 0.345075622969)
     assert np.all(np.diff(x) > 0)
-    close(under_displacement(law, p, state, d)[1], jnp.array([at * (1 + 1e-9), (at + top) / 2, 1.01 * top]), rel=1e-12)
+    close(law.path(p, state, d)[1], jnp.array([at * (1 + 1e-9), (at + top) / 2, 1.01 * top]), rel=1e-12)
     # Below the force reached it unloads elastically from where it is.
-    _, d = under_load(law, p, state, jnp.array([0.5 * at]))
-    close(under_displacement(law, p, state, d)[1], jnp.array([0.5 * at]), rel=1e-12)
+    _, d = law.path_load(p, state, jnp.array([0.5 * at]))
+    close(law.path(p, state, d)[1], jnp.array([0.5 * at]), rel=1e-12)
 
 
 @pytest.mark.extended
