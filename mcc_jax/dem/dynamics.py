@@ -1,26 +1,34 @@
-"""Explicit motion of a packing between walls: one step, many steps, neighbour lists renewed as needed; precision."""
+"""Explicit motion of a packing between walls: one step, many steps, neighbour lists renewed as needed; devices."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from .. import arguments
 from .._format import described
 from .._numerics import recompute
-from .forces import Forces, Motion, contact_forces
-from .neighbours import stacked_lists, with_list
+from .forces import Forces, Motion, bodies_of, contact_forces, pair_loads, wall_loads
+from .neighbours import PADDING, Edges, pad_rows, stacked_lists, with_list
 from .pair import wall_force, wall_recovery
-from .sharded import Contacts, Devices, gathered, sharded
-from .state import Packing, State, check_state, measured, rebuild_list
+from .state import Packing, State, WallHistory, check_state, measured, rebuild_list
 from .walls import Walls, set_velocity
+
+AXIS = "shares"
+
+Devices: TypeAlias = Sequence[jax.Device]  # pyright: ignore[reportInvalidTypeForm]  # JAX names it by assignment
+Contacts: TypeAlias = Callable[..., tuple[Forces, Edges, WallHistory]]
+"""What computes all contact forces, with the arguments of `contact_forces`."""
 
 
 class Segment(NamedTuple):
@@ -107,9 +115,17 @@ def run(
     return sharded(loop, devices, packing, motion, state, jnp.asarray(wanted))[0]
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _run_while_listed(devices: Devices | None, *given: Any) -> tuple[State, tuple[Array, Array]]:
-    """Steps while the list is complete: no particle further than half the skin from where it was listed."""
+    """Steps while the list is complete, with values of this process in and out: it makes the next list."""
+    if devices is None:
+        return _while_listed(None, *given)
+    found = _while_listed(tuple(devices), *jax.tree.map(np.asarray, given))
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), found)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _while_listed(devices: Devices | None, *given: Any) -> tuple[State, tuple[Array, Array]]:
+    """Steps until a particle is further than half the skin from where it was listed."""
 
     def loop(contacts: Contacts, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""]) -> Any:
         def list_valid(carry):
@@ -170,7 +186,7 @@ def advance(
     for _ in range(rows):
         left, on_wall = steps, 0.0
         while left:
-            state, (done, force) = gathered(_run_while_listed, devices, packing, motion, state, jnp.asarray(left))
+            state, (done, force) = _run_while_listed(devices, packing, motion, state, jnp.asarray(left))
             on_wall = on_wall + force
             left -= int(done)
             if tape is not None and int(done):
@@ -241,3 +257,78 @@ def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, 
 
     history = {name: single(getattr(state, name)) for name in ("velocity", "spin", "edges", "wall_history")}
     return single(packing), single(motion), replace(state, **history)
+
+
+# ---- contacts divided over devices and processes: each computes its share, one sum a step brings them together -------
+
+
+def sharded[Moving: eqx.Module](
+    loop: Callable[..., tuple[Moving, Any]],
+    devices: Devices | None,
+    packing: Packing,
+    motion: eqx.Module,
+    state: Moving,
+    *further: jax.Array,
+) -> tuple[Moving, Any]:
+    """A loop over time steps with its contacts divided over devices; differentiable like the loop itself.
+
+    Edges, sorted by key, are divided in contiguous shares of equal length, contacts with walls by particle. Every
+    device has and moves all particles; a step needs one reduction, of forces, torques and forces on walls. The loop is
+    called with what computes the contact forces, packing, motion, state and what is further; it returns the state, and
+    anything that is the same on all devices. Without devices nothing is divided.
+    """
+    if devices is None:
+        return loop(contact_forces, packing, motion, state, *further)
+    mesh = Mesh(np.asarray(devices), (AXIS,))
+    lengths = [x.shape[0] for x in _remembered(state)]
+    whole, share = PartitionSpec(), PartitionSpec(AXIS)
+    padded = _padded(state, len(devices))
+    specs = eqx.tree_at(_sharded_leaves, jax.tree.map(lambda _: whole, padded), (share,) * len(_sharded_leaves(padded)))
+
+    def one_share(packing: Packing, motion: eqx.Module, state: Moving, *further: jax.Array) -> tuple[Moving, Any]:
+        # Marked once, outside the loop: its derivative is then summed over devices once, not in every step.
+        own = jax.lax.pcast(packing, AXIS, to="varying")
+        return loop(functools.partial(_share_of_contacts, own), packing, motion, state, *further)
+
+    moved, rest = jax.shard_map(
+        one_share, mesh=mesh, in_specs=(whole, whole, specs, *(whole for _ in further)), out_specs=(specs, whole)
+    )(packing, motion, padded, *further)
+    everywhere = NamedSharding(mesh, whole)
+    remembered = zip(_remembered(moved), lengths, strict=True)
+    kept = [jax.lax.with_sharding_constraint(x[:n], everywhere) for x, n in remembered]
+    return eqx.tree_at(_sharded_leaves, moved, (*_sharded_leaves(state)[:3], *kept)), rest
+
+
+def _sharded_leaves(state: Any) -> tuple[jax.Array, ...]:
+    """What is dealt out, one row an edge or a particle."""
+    return (state.edges.key, state.edges.i, state.edges.j, *_remembered(state))
+
+
+def _remembered(state: Any) -> tuple[jax.Array, ...]:
+    edges, history = state.edges, state.wall_history
+    return edges.overlap_max, edges.slip, history.overlap_max, history.slip
+
+
+def _padded(state: Any, parts: int) -> Any:
+    """The state with as many edges, and rows of contacts with walls, as divide among the parts."""
+    key, *others = _sharded_leaves(state)
+    longer = (pad_rows(x, parts * math.ceil(len(x) / parts)) for x in others)
+    return eqx.tree_at(_sharded_leaves, state, (pad_rows(key, parts * math.ceil(len(key) / parts), PADDING), *longer))
+
+
+def _share_of_contacts(packing: Packing, _: Packing, motion: Motion, state: State) -> tuple[Forces, Edges, WallHistory]:
+    """`contact_forces` on one device of several, which holds a share of the edges and of the contacts with walls."""
+    moving = jax.lax.pcast((state.position, state.velocity, state.spin), AXIS, to="varying")
+    bodies = bodies_of(packing, *moving)
+    loads, edges = pair_loads(motion, bodies, state.edges)
+    particles, rows = loads.shape[0], state.wall_history.slip.shape[0]
+    own = jax.lax.axis_index(AXIS) * rows + jnp.arange(rows)
+    index = jnp.minimum(own, particles - 1)
+    # The last share may be short: a radius below zero touches nothing.
+    some = jax.tree.map(lambda x: x[index], bodies)
+    some = eqx.tree_at(lambda b: b.radius, some, jnp.where(own < particles, some.radius, -1.0))
+    at_walls, on_wall, history = wall_loads(motion, state.walls, some, state.wall_history)
+    loads = loads.at[index].add(at_walls)
+    loads = jax.lax.psum(jnp.concatenate([loads, jnp.pad(on_wall, ((0, 0), (0, 3)))]), AXIS)
+    forces = Forces(loads[:particles, :3], loads[:particles, 3:], loads[particles:, :3])
+    return forces, edges, history
