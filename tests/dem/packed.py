@@ -7,27 +7,18 @@ import jax
 import numpy as np
 
 from mcc_jax import paper_law
-from mcc_jax.dem import (
-    Interaction,
-    Motion,
-    contact_forces,
-    die,
-    scattered,
-    spheres,
-    stable_time_step,
-    start,
-)
+from mcc_jax.dem import Interaction, Motion, contact_forces, die, scattered, spheres, stable_time_step, start
 
 DIE_RADIUS = 2.2e-4
 SKIN = 2e-5
 CAPACITY = 320
-"""Room for all pairs of 24 spheres: with one length of list everything compiles once."""
+"""Enough for all pairs of 24 spheres: with one length of list everything compiles once."""
 PRESSING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
 
 
 @functools.cache
-def packing(count=24):
-    diameter = jax.random.uniform(jax.random.key(1), (count,), minval=80.0, maxval=120.0)
+def packing():
+    diameter = jax.random.uniform(jax.random.key(1), (24,), minval=80.0, maxval=120.0)
     return spheres(paper_law(), diameter)
 
 
@@ -37,19 +28,14 @@ def squeezed(position, share):
 
 
 @functools.cache
-def dense(count=24):
+def loose(squeeze=1.0):
+    position, height = scattered(jax.random.key(0), packing().radius, DIE_RADIUS)
+    return start(packing(), die(DIE_RADIUS, squeeze * height), squeezed(position, squeeze), SKIN, CAPACITY)
+
+
+def dense():
     """A state in which every particle presses on its neighbours: a loose packing squeezed along z at one stroke."""
-    spheres_ = packing(count)
-    position, height = scattered(jax.random.key(0), spheres_.radius, DIE_RADIUS)
-    squeeze = 0.72
-    return start(spheres_, die(DIE_RADIUS, squeeze * height), squeezed(position, squeeze), SKIN, CAPACITY)
-
-
-@functools.cache
-def loose(count=24):
-    spheres_ = packing(count)
-    position, height = scattered(jax.random.key(0), spheres_.radius, DIE_RADIUS)
-    return start(spheres_, die(DIE_RADIUS, height), position, SKIN, CAPACITY)
+    return loose(0.72)
 
 
 @functools.cache
