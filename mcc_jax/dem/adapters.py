@@ -18,11 +18,9 @@ from .pair import HalfContact, largest_overlap, pair_energy, pair_force, sides_o
 def edges_from_jaxmd(neighbours: Any, capacity: int | None = None) -> Edges:
     """Edges of virgin contacts from a `jax_md.partition.NeighborList`; give them history with `carry_history`.
 
-    jax-md makes its lists for one cut-off: with spheres of several sizes take the largest sum of two radii.
-
-    Args:
-        neighbours: a list of format OrderedSparse or Sparse (``pip install mcc-jax[jaxmd]``).
-        capacity: length of the list of edges; that of jax-md's if None.
+    The list has the format OrderedSparse or Sparse (``pip install mcc-jax[jaxmd]``), the edges its length if no
+    `capacity` is given. jax-md makes its lists for one cut-off: with spheres of several sizes take the largest sum of
+    two radii.
 
     Raises:
         InputError: if the list is dense, or if it overflowed and so pairs are missing.

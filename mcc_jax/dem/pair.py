@@ -104,12 +104,8 @@ def half_contact(law: MccLaw, particle: Particle, normal: Float[Array, " 3"] | N
     is the radius of Gaussian curvature where the tangent plane of the ellipsoid has that normal. Along e3 this is the
     paper's particle exactly; in other directions it is our own generalisation, which no test supports yet. Effects on
     parameters (size, shape) take the particle as it is tested, along D3; those on the modulus take strain and stress of
-    this side at its own peak.
-
-    Args:
-        law: the particle's own law; particles of one pair may differ in all of it but the unloading form.
-        particle: its diameters [um].
-        normal: unit vector in the frame of the particle's axes; e3 if None.
+    this side at its own peak. Particles of one pair may differ in all of their laws but the unloading form. `normal` is
+    a unit vector in the frame of the particle's axes, e3 if None.
 
     Raises:
         InputError: naming an effect that is no closed formula (`AbstractEffect.closed`), or by which it gains energy.
@@ -149,16 +145,11 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
         \delta_P = d_i + d_j, \quad F_i(d_i) = F_j(d_j) = F_P, \qquad
         F = F_P\, f(q), \quad q = (\delta_P - \delta) / (\Delta_i + \Delta_j)
 
-    with f of `law.stress_ratio`. The equal-force split is unique where both sides are monotone. Both sides peaked at
-    the same force, so they unload by the same share of it, and the largest overlap is all there is to remember. Each
-    side recovers no more than its own limit. Value and first derivatives, in both modes, are finite everywhere; at the
-    onset of unloading the derivative is that of loading.
-
-    Args:
-        i: one half contact.
-        j: the other; exchanging the two changes nothing but rounding.
-        overlap_max: largest overlap before this one [m], 0 for a virgin contact.
-        overlap: overlap now [m]; negative where the particles do not touch.
+    with f of `law.stress_ratio`. `overlap_max` is the largest overlap before this one [m], 0 for a virgin contact, and
+    `overlap` that of now, negative where the particles do not touch. The equal-force split is unique where both sides
+    are monotone. Both sides peaked at the same force, so they unload by the same share of it, and the largest overlap
+    is all there is to remember. Each side recovers no more than its own limit. Value and first derivatives, in both
+    modes, are finite everywhere; at the onset of unloading the derivative is that of loading.
 
     Raises:
         InputError: if one side unloads by the printed form and the other by a punch form.
