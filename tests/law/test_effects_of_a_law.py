@@ -32,16 +32,6 @@ def test_a_frame_adds_compliance_times_force_and_nothing_else():
     close(frame - base, COMPLIANCE * FORCE, rel=1e-12, scale=1e-12 * float(base.max()))
 
 
-def test_a_law_without_effects_is_the_base_law_to_the_last_bit():
-    emptied = creeping().of_particle().with_effects()
-    assert [effect.name for effect in emptied.effects] == ["creep:logarithmic"]
-    none = eqx.tree_at(lambda law: law.effects, emptied, ())
-    np.testing.assert_array_equal(
-        drive(none, PARTICLE, FORCE, control="load").displacement,
-        drive(LAW, PARTICLE, FORCE, control="load").displacement,
-    )
-
-
 @pytest.mark.extended
 def test_batches_and_the_state_that_is_carried_on():
     law = creeping()
@@ -78,18 +68,12 @@ def test_a_variant_of_ones_own_goes_the_same_way():
     close(added, glue.typical * FORCE, rel=1e-9, scale=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("effects", "words"),
-    [
-        (("rust",), "there is no mechanism 'rust'"),
-        (("creep:cubic",), "creep has no variant 'cubic'"),
-        ((3.0,), "an effect must be"),
-    ],
-)
-def test_what_is_no_effect_is_refused_by_name(effects, words):
-    with pytest.raises(InputError, match=words):
-        LAW.with_effects(*effects)
+def test_effects_are_taken_by_name_and_anything_else_is_refused():
     assert MccLaw(Plastic(7.0, 3.0, 2.7), 1.4, 16000.0, effects="creep").effects[0].name.startswith("creep:")
+    with pytest.raises(InputError, match="there is no mechanism 'rust'"):
+        LAW.with_effects("rust")
+    with pytest.raises(InputError, match="an effect must be"):
+        LAW.with_effects(3.0)
 
 
 @pytest.mark.extended
