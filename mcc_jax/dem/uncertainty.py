@@ -281,7 +281,7 @@ def fit_compaction(
 
     with the sensitivities of the load steps. Within a round the load steps are those of a compaction at the round's
     start (`replay_compaction`); rounds go on until the parameters stay, because contacts may snap elsewhere.
-    `packing_of` is the packing as a function of parameters, of which `start` are the first: take logarithms of positive
+    `packing_of` is the packing as a function of parameters, `start` a first guess of them: take logarithms of positive
     ones; the modulus needs rows of unloading. State, heights and solver are as for `compact`, `force` is that on the
     top punch at the heights [N].
 
