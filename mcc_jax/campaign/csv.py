@@ -41,9 +41,8 @@ _DIAMETERS = {"D1": "length", "D2": "length", "D3": "length"}
 def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     """Read a folder with `particles.csv`, `curves.csv` and perhaps `campaign.toml`, and check all of it.
 
-    Lengths become um, forces mN, times s, whatever units the columns are named with. Rows of different particles
-    may be mixed; within a particle they must be in the order of time. Raises `InputError` if anything is missing,
-    damaged or contradictory; it names file, row and column.
+    Lengths become um, forces mN, times s, whatever units the columns are named with. Rows of a particle must be in the
+    order of time. `InputError` names file, row and column if anything is missing, damaged or contradictory.
     """
     path = arguments.file_path(folder, "folder")
     _check_folder(path)

@@ -89,13 +89,13 @@ def _facts(header: list[tuple[str, str]]) -> dict[str, Any]:
             segments.append({})
         segments[-1][key.removeprefix("Segment ")] = value
     other: dict[str, Any] = {}
-    # nm/uN is um/mN.
-    compliance = leading_number(plain.get("Machine Comp", ""))
-    if compliance is not None and plain["Machine Comp"].endswith(("nm/µN", "nm/uN", "nm/μN")):
-        other["machine_compliance_um_per_mN"] = compliance
-    drift = leading_number(plain.get("Drift Rate", ""))
-    if drift is not None and plain["Drift Rate"].endswith("nm/s"):
-        other["drift_rate_um_per_s"] = drift / 1e3
+    for key, units, name, divisor in (
+        ("Machine Comp", ("nm/µN", "nm/uN", "nm/μN"), "machine_compliance_um_per_mN", 1.0),  # nm/uN is um/mN
+        ("Drift Rate", ("nm/s",), "drift_rate_um_per_s", 1e3),
+    ):
+        value = leading_number(plain.get(key, ""))
+        if value is not None and plain[key].endswith(units):
+            other[name] = value / divisor
     return other | {"programmed_segments": segments, "instrument_header": plain}
 
 

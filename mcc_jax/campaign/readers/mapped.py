@@ -323,13 +323,13 @@ class _Reader:
         if (asked := self.mapping.diameters) is None:
             return None
         try:
-            found = [self._length(name, start, min(stop, self.count)) for name in asked.names]
+            found = [self._length(name, asked.unit, start, min(stop, self.count)) for name in asked.names]
         except InputError as error:
             return error
         return found * 3 if len(found) == 1 else found
 
-    def _length(self, name: str, start: int, stop: int) -> float:
-        """The length [um] in the first row that begins with a name."""
+    def _length(self, name: str, unit: str | None, start: int, stop: int) -> float:
+        """The length [um] in the first row that begins with a name; it has this unit, or one of its own."""
         for i in range(start, stop):
             if not self.rows.begins(i, name):
                 continue
@@ -343,7 +343,7 @@ class _Reader:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise self.wrong(problem, _OWN_DIAMETER, i)
             try:
-                factor = self.mapping.diameter_factor or unit_factor("".join(units[:1]), "length")
+                factor = unit_factor("".join(units[:1]) if unit is None else unit, "length")
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
                 raise self.wrong(str(error), remedy, i, name) from None

@@ -165,7 +165,9 @@ class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
         self.delimiter, self.thousands = delimiter, None if self.thousands is None else thousands
         for name, triple in (self.diameters_um or {}).items():
             arguments.one_particle(triple, f"diameters_um of {name!r}")
-        _ = self.pace, self.sources, self.diameter_factor
+        if sizes and sizes.unit is not None:
+            _factor(sizes.unit, "length", "diameters")
+        _ = self.pace, self.sources
 
     @cached_property
     def pace(self) -> Pace | None:
@@ -203,12 +205,6 @@ class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
                 factor = _factor(entry.unit, DIMENSIONS[name], f"columns.{name}")
                 found[name] = Source(entry.column, factor, entry.sign)
         return found
-
-    @cached_property
-    def diameter_factor(self) -> Fraction | None:
-        """Micrometres in the unit of diameters in the header; None where the file holds the unit."""
-        unit = None if self.diameters is None else self.diameters.unit
-        return None if unit is None else _factor(unit, "length", "diameters")
 
     @property
     def sizes_um(self) -> Diameters | None:
