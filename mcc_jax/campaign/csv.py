@@ -148,23 +148,24 @@ def _read_curves(file: Path, particles: Sequence[str], sizes: Table) -> tuple[Cu
         name = min(unknown, key=lambda one: rows[one][0])
         problem = f"the particle {name!r} is not in {PARTICLES}" if name.strip() else "the name is empty"
         raise table.wrong(problem, rows[name][0], where, "Add its diameters there or remove its rows here")
-    curves = []
+    curves, (time, force, displacement) = [], channels.values()
     for name in particles:
-        curve = Curve(*(values[rows[name]] for values in channels.values()))
+        at = rows[name]
+        curve = Curve(time[at], force[at], displacement[at])
         if (fault := fault_of(name, curve)) is not None:
             column = dict(zip(DIMENSIONS, channels, strict=True)).get(fault.channel, where)
-            raise table.wrong(fault.problem, rows[name][fault.reading], column, fault.remedy)
+            raise table.wrong(fault.problem, at[fault.reading], column, fault.remedy)
         curves.append(curve)
     return tuple(curves)
 
 
-def _rows_of(names: Sequence[str], particles: Sequence[str]) -> Mapping[str, np.ndarray]:
+def _rows_of(names: Sequence[str] | np.ndarray, particles: Sequence[str]) -> Mapping[str, np.ndarray]:
     """The records of each particle, also where a name differs from that of the particle in its Unicode form only."""
     import pandas as pd
 
     codes, written = pd.factorize(np.array(names, object))
     form = {same_text(name): name for name in reversed(particles)} | {name: name for name in particles}
-    known = [form.get(name, form.get(same_text(name), name)) for name in written]
+    known = [form.get(name, form.get(same_text(name), name)) for name in map(str, written)]
     places = {name: place for place, name in enumerate(dict.fromkeys(known))}
     which = np.array([places[name] for name in known])[codes]
     records = np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])

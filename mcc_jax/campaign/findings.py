@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from .._format import described, first_few
 
@@ -61,7 +61,9 @@ class Finding:
 
 def worst(findings: Iterable[Finding]) -> Level | None:
     """The most serious level among findings, None where there are none."""
-    return max((one.level for one in findings), key=get_args(Level).index, default=None)
+    levels = {one.level for one in findings}
+    order: tuple[Level, ...] = ("error", "warning", "info")
+    return next((level for level in order if level in levels), None)
 
 
 def named(names: tuple[str, ...], of: int, most: int = 5) -> str:

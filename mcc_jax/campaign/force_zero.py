@@ -106,7 +106,7 @@ def shared_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float]
     """The zero that all checked tests share, and its error [mN]; None if they share none, or none has this finding.
 
     Every test of one load cell begins within a step of its ramp above its zero: the line of first readings over first
-    steps, weighted by the step, meets the zero where the step is nil. Of fewer than three tests it is the lowest reading.
+    steps, weighted by the step, meets the zero where the step is nil. Of two tests it is the lowest reading.
     """
     checked = [curve.checked for curve in curves]
     if all(one.code != needed.code for each in checked if each is not None for one in each.findings):

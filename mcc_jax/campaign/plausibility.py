@@ -35,10 +35,9 @@ STIFFER = 3.0
 def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) -> tuple[Finding, ...]:
     """Report what a wrong unit, sign or column would explain in a campaign; nothing is changed or refused.
 
-    Judges the raw tests: each test's peak, the stiffness of loading and unloading, the work given back, its sizes and
-    its times; and the effective modulus of a fit. A finding is an "error" for a likely error, with the column and the
-    remedy, and for numbers that no solid has; "info" where the material is not like microcrystalline cellulose. It
-    names the particles where not all are concerned.
+    Judges the raw tests: peak, stiffness of loading and unloading, the work given back, sizes and times; and the
+    effective modulus of a fit. A finding is an "error" for a likely error, with the column and the remedy, and for
+    numbers that no solid has; "info" where the material is not like microcrystalline cellulose.
     """
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause

@@ -51,6 +51,7 @@ def campaign_of(kind: Kind, seed: int) -> Campaign:
 
 def run_one(kind: Kind, seed: int, method: str) -> Outcome:
     """Run one case by one method and judge how it ends."""
+    campaign: Campaign | None = None
     content: dict[str, Any] | None = None
     text, fault = "", ""
     try:
@@ -70,7 +71,7 @@ def run_one(kind: Kind, seed: int, method: str) -> Outcome:
     except Exception as error:  # whatever it is, it is what is looked for
         where = traceback.extract_tb(error.__traceback__)[-1]
         fault = f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {error}"
-    if content is not None:
+    if campaign is not None and content is not None:
         how = "converged" if content["converged"] else "not converged"
         return Outcome(how, " | ".join(content["warnings"]), _judge_result(kind, method, content, campaign))
     if fault:

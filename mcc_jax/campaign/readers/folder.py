@@ -19,6 +19,7 @@ from typing import Any
 from ..._errors import InputError
 from ..._format import counted, first_few
 from ..findings import Finding
+from ..schema import Control
 from ..table import read_bytes, same_text
 from .text import Tests
 
@@ -82,7 +83,7 @@ def read_folder(
             remedy = f"If it is one particle, leave it out with {_leave_out(alike[1:])}"
             findings.append(Finding("duplicates", "warning", sentence, remedy, tuple(same_text(f.stem) for f in alike)))
     form = f"{counted(len(files), 'file')}, {' and '.join(sorted({tests.format for tests in found.values()}))}"
-    controls = {tests.control for tests in found.values()}
+    controls: set[Control | None] = {tests.control for tests in found.values()}
     whole = Tests({}, form, controls.pop() if len(controls) == 1 else None, _other(found))
     own = Counter(name for tests in found.values() for name in tests.curves)
     keys: dict[str, tuple[str, ...]] = {}
