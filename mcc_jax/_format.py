@@ -102,6 +102,11 @@ def probability(value: float | int | None) -> str:
     return "above 0.99" if value > 0.995 else number(value, 2)
 
 
+def with_unit(value: float | None, unit: str, form: str = ".2g") -> str:
+    """A value of the library with its unit, which is "-" where there is none; "unknown" without a value."""
+    return ("unknown" if value is None else format(value, form)) + ("" if unit == "-" else f" {unit}")
+
+
 def span(values: Any, unit: str, digits: int = 4) -> str:
     """Smallest and largest, or the one value."""
     low, high = number(float(np.min(values)), digits), number(float(np.max(values)), digits)

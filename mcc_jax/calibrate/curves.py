@@ -159,6 +159,12 @@ class FittedCurve:
         away = (self.displacement_um - self.own_um)[self.used]
         return float(np.sqrt(np.mean(away**2))) if len(away) and np.isfinite(away).all() else None
 
+    @property
+    def inside(self) -> np.ndarray:
+        """Of every compared point with a band, whether it lies inside; empty without a posterior."""
+        known = self.used & np.isfinite(self.low_um)
+        return ((self.displacement_um >= self.low_um) & (self.displacement_um <= self.high_um))[known]
+
 
 def measured_curves(campaign: Campaign) -> tuple[FittedCurve, ...]:
     """The tests of a campaign that nobody calibrated."""

@@ -132,6 +132,11 @@ class Metadata:
                 object.__setattr__(self, name, arguments.number(value, name, above=0))
         object.__setattr__(self, "corrections", _texts(self.corrections, "corrections"))
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the data were computed, not measured, as far as the metadata say."""
+        return "simulation" in self.other or "not a measurement" in (self.provenance or "")
+
 
 @dataclass(frozen=True, repr=False)
 class Campaign:

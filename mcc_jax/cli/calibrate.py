@@ -4,41 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
-from .._extras import extra
-from .._store import Stage, results
+from .._store import results
 from . import options as common
-from .session import (
-    NOT_CONVERGED,
-    drop_earlier,
-    joint_model,
-    provenance,
-    read_without,
-    require_particle,
-    say,
-    say_files,
-    say_json,
-    say_next,
-    say_table,
-    sentence,
-    session,
-    write_figures,
-)
+from .printing import say, say_files, say_json, say_next, say_table, sentence
+from .session import NOT_CONVERGED, joint_model, provenance, read_without, session, write_result
 
 if TYPE_CHECKING:
     from .._types import Progress
-    from ..calibrate import LeastSquares, PaperCalibration, Posterior
     from ..campaign import Campaign
+    from .session import Calibration
 
-    type Calibration = PaperCalibration | LeastSquares | Posterior
-
-RESULT, POSTERIOR, ARCHIVE = "calibration.json", "posterior.nc", "calibration.msgpack"
+RESULT = "calibration.json"
 METHODS = ("paper", "least-squares", "bayes")
 NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
 
@@ -62,23 +45,17 @@ JOINT, BAYES, SQUARES, PAPER = _of("least-squares", "bayes"), _of("bayes"), _of(
 @common.campaign
 @common.out(required=True)
 @click.option("--method", type=click.Choice(METHODS), default="bayes", show_default=True, help="How to calibrate.")
-@common.leave_out
+@common.leave_out()
 @common.threshold(". paper: of the offset step, which 0 leaves out; otherwise: points below it do not count.")
 @common.priors(**JOINT)
 @click.option("--modulus-scatter", is_flag=True, help="Let every particle have its own modulus.", **JOINT)
-@click.option(
-    "--effect",
-    "effects",
-    multiple=True,
-    metavar="MECHANISM[:VARIANT]",
-    help="An effect that acts on the law, fitted with it; repeatable.",
-    **JOINT,
-)
-@click.option(
+@common.effect("MECHANISM[:VARIANT]", "An effect that acts on the law, fitted with it; repeatable.", **JOINT)
+@common.option(
     "--varying",
+    "MECHANISM",
+    str,
+    "Such an effect whose amplitude differs from particle to particle; repeatable.",
     multiple=True,
-    metavar="MECHANISM",
-    help="Such an effect whose amplitude differs from particle to particle; repeatable.",
     **JOINT,
 )
 @click.option("--shape-scatter", is_flag=True, help="Allow the shape parameter a to vary between particles.", **JOINT)
@@ -99,11 +76,8 @@ JOINT, BAYES, SQUARES, PAPER = _of("least-squares", "bayes"), _of("bayes"), _of(
 @common.one_of(
     "--objective", ("full", "reference"), "Which objective's a the rest is built on; both are reported.", **PAPER
 )
-@click.option(
-    "--reference",
-    metavar="NAME",
-    help="Reference particle of that objective; by the paper's rule if absent.",
-    **PAPER,
+@common.option(
+    "--reference", "NAME", str, "Reference particle of that objective; by the paper's rule if absent.", **PAPER
 )
 @common.law
 @common.no_figures
@@ -142,12 +116,12 @@ def calibrate(
     with session() as progress:
         data = read_without(campaign, options["leave_out"], progress)
         if options["reference"] is not None:
-            require_particle(options["reference"], data, "--reference")
+            data.index(options["reference"])  # refuses a name that is not there before anything is computed
         settings = {name: value for name, value in context.params.items() if name not in without}
         origin = provenance("calibrate", campaign, settings)
         with results(out) as stage:
             calibration = _calibrated(data, method, options, progress)
-            content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, progress=progress)
+            content = write_result(calibration, stage, origin=origin, figures=not no_figures, progress=progress)
     if as_json:
         say_json(content)
     else:
@@ -175,35 +149,6 @@ def _calibrated(data: Campaign, method: str, options: dict[str, Any], progress: 
     if method == "least-squares":
         return least_squares(data, model, loss=options["loss"], **shared)
     return sample(data, model, **{name: options[name] for name in ("mode", "chains", "draws")}, **shared)
-
-
-def write_calibration(
-    calibration: Calibration, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
-) -> dict[str, Any]:
-    """Write the calibration, the figures and, if there is one, the posterior into the stage.
-
-    `origin` is what `provenance` gives. Returns the contents of `calibration.json`.
-    """
-    from ..calibrate import Posterior
-
-    def draw() -> Mapping[str, Any]:
-        from ..plots import least_squares_figures, paper_figures, posterior_figures
-
-        draws: dict[str, Callable[[Any], Mapping[str, Any]]]
-        draws = {"paper": paper_figures, "least-squares": least_squares_figures, "bayes": posterior_figures}
-        return draws[calibration.to_json()["method"]](calibration)
-
-    names = write_figures(stage, draw if figures else None, progress)
-    files = [ARCHIVE]
-    if isinstance(calibration, Posterior):
-        progress("writing the posterior")
-        with extra("netcdf"):
-            import h5netcdf  # noqa: F401
-            import h5py  # noqa: F401
-        calibration.to_arviz(seed=calibration.seed).to_netcdf(stage.folder / POSTERIOR, engine="h5netcdf")
-        files.append(POSTERIOR)
-    drop_earlier(stage, RESULT, [*names, *files])
-    return calibration.write(stage.folder, figures=names, files=files, provenance=dict(origin))
 
 
 def say_calibration(content: dict[str, Any], *, numbers: bool = True) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 import click
 
 from . import options as common
-from .session import say, say_next, session
+from .printing import say, say_next
+from .session import session
 
 KINDS = ("approach", "load", "hold", "unload", "reload")
 
@@ -21,23 +22,19 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
     "Diameters in um of all tests, or a table (CSV or xlsx) with particle,D1_um,D2_um,D3_um, in which particles are "
     "called like tests or files; D3 lies along the compression."
 )
-@click.option(
+@common.option(
     "--mapping",
-    type=common.Location(),
+    "FILE",
+    common.Location(),
+    "TOML file that describes the columns, for any other text table or Excel workbook; repeatable, for a FOLDER of "
+    "several kinds of files: each is read by the one that fits.",
     multiple=True,
-    metavar="FILE",
-    help="TOML file that describes the columns, for any other text table or Excel workbook; repeatable, for a FOLDER "
-    "of several kinds of files: each is read by the one that fits.",
 )
-@click.option(
-    "--leave-out",
-    "skip",
-    multiple=True,
-    metavar="NAME",
-    help='A file of FOLDER to leave out; may hold "*" and "?"; repeatable.',
-)
+@common.leave_out('A file of FOLDER to leave out; may hold "*" and "?"; repeatable.')
 @common.no_seed
-def convert(file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...]) -> None:
+def convert(
+    file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], leave_out: tuple[str, ...]
+) -> None:
     """Turn FILE, an instrument's export, or all exports of FOLDER into a campaign.
 
     Known formats: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip, recognised by
@@ -80,8 +77,8 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: tuple[Path, .
         progress("reading")
         sizes = None if diameters is None else read_diameters(diameters)
         given = [*mapping, *([] if diameters is None else [Path(diameters)])]
-        skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
-        campaign = read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=skip)
+        leave_out += tuple(path.name for path in given if _lies_in(path, file) and path.name not in leave_out)
+        campaign = read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=leave_out)
         progress("finding the segments")
         segments = Counter(part.kind for curve in campaign.curves for part in find_segments(curve))
         progress("writing")

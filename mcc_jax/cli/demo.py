@@ -14,10 +14,11 @@ import click
 
 from .._store import Stage, results
 from . import options as common
-from .calibrate import say_calibration, write_calibration
-from .discover import DISCOVERY, write_discovery
+from .calibrate import say_calibration
+from .discover import DISCOVERY
 from .outputs import REPORT
-from .session import provenance, say, say_files, say_table, session
+from .printing import say, say_files, say_table
+from .session import provenance, session, write_result
 
 if TYPE_CHECKING:
     from .._types import Progress
@@ -114,9 +115,9 @@ def _job(
     write_files(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, folder="campaign")
     written: dict[str, Any] = {"origin": origin, "figures": True, "progress": progress}
-    content = write_calibration(sample(campaign, seed=seed, progress=progress), stage, **written)
+    content = write_result(sample(campaign, seed=seed, progress=progress), stage, **written)
     found = discover(campaign, experiments=False, seed=seed, progress=progress)
-    missing = write_discovery(found, stage, **written)
+    missing = write_result(found, stage, **written)
     page = report_page(read_results(stage.folder, name=stage.directory.resolve().name), progress=progress)
     (stage.folder / REPORT).write_text(page, encoding="utf-8")
     return content, missing

@@ -3,33 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from .._errors import InputError
-from .._store import Stage, json_text, results
+from .._store import json_text, results
 from . import options as common
-from .session import (
-    drop_earlier,
-    joint_model,
-    provenance,
-    read_without,
-    say,
-    say_files,
-    say_json,
-    say_next,
-    say_table,
-    sentence,
-    session,
-    write_figures,
-)
-
-if TYPE_CHECKING:
-    from .._types import Progress
-    from ..discovery import Discovery
+from .printing import say, say_files, say_json, say_next, say_table, sentence
+from .session import joint_model, provenance, read_without, session, write_result
 
 DISCOVERY, POWER = "discovery.json", "power.json"
 ROWS = 6
@@ -40,7 +22,7 @@ ROWS = 6
 @common.campaign
 @common.out(required=True)
 @common.exclude
-@common.leave_out
+@common.leave_out()
 @common.threshold(default=0.0)
 @common.priors()
 @common.law
@@ -54,16 +36,7 @@ ROWS = 6
 @common.no_figures
 @common.seed("Seed of the bootstrap.")
 @common.json(DISCOVERY)
-def discover(
-    campaign: Path,
-    out: Path,
-    no_held_out: bool,
-    no_experiments: bool,
-    no_posterior: bool,
-    no_figures: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+def discover(campaign: Path, out: Path, no_figures: bool, as_json: bool, **options: Any) -> None:
     """Find where the law and the tests in the folder CAMPAIGN disagree, name what is missing, add it to the law, and
     show on particles that took no part that the gap is closed.
 
@@ -85,58 +58,32 @@ def discover(
     with session() as progress:
         from ..discovery import discover as find
 
-        require_mechanisms(options["exclude"])
         data = read_without(campaign, options["leave_out"], progress)
-        parts = {"experiments": not no_experiments, "posterior": not no_posterior}
-        origin = provenance("discover", campaign, options | {"held_out": not no_held_out} | parts)
-        chosen: dict[str, Any] = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")} | parts
+        parts = {part: not options.pop(f"no_{part}") for part in ("held_out", "experiments", "posterior")}
+        origin = provenance("discover", campaign, options | parts)
+        chosen: dict[str, Any] = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")}
+        chosen |= {"confirm": parts.pop("held_out"), **parts}
         with results(out) as stage:
-            found = find(data, model=joint_model(options), confirm=not no_held_out, progress=progress, **chosen)
-            content = write_discovery(found, stage, origin=origin, figures=not no_figures, progress=progress)
+            found = find(data, model=joint_model(options), progress=progress, **chosen)
+            content = write_result(found, stage, origin=origin, figures=not no_figures, progress=progress)
     if as_json:
         say_json(content)
         return
-    from ..calibrate.results import DISCOVERY_ARCHIVE
     from ..report.texts import calibration_with_found
 
     say_discovery(content)
-    say_files(out, [*content["figures"], DISCOVERY_ARCHIVE, DISCOVERY])
+    say_files(out, [*content["figures"], *content["files"], DISCOVERY])
     say_next(
         (calibration_with_found(content, shlex.quote(str(campaign))), "the law with what was found"),
         (f"mcc-jax report {shlex.quote(str(out))}", "all of it on one page"),
     )
 
 
-def require_mechanisms(names: tuple[str, ...]) -> None:
-    """Refuse to exclude what does not exist, before anything is computed."""
-    from ..effects import LIBRARY
-
-    for name in names:
-        if name not in LIBRARY:
-            raise InputError(f"there is no mechanism {name!r}", remedy=f"--exclude takes one of: {', '.join(LIBRARY)}")
-    if set(names) >= set(LIBRARY):
-        raise InputError("every mechanism is excluded", remedy="Leave one to look for")
-
-
-def write_discovery(
-    found: Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
-) -> dict[str, Any]:
-    """Write `discovery.json` and the figures into the stage; see `write_calibration`."""
-
-    def draw() -> Mapping[str, Any]:
-        from ..plots import discovery_figures
-
-        return discovery_figures(found)
-
-    names = write_figures(stage, draw if figures else None, progress)
-    drop_earlier(stage, DISCOVERY, names)
-    return found.write(stage.folder, figures=names, provenance=dict(origin))
-
-
 def say_discovery(content: dict[str, Any]) -> None:
     """Print verdict, summary, notes, and the head of the ranking."""
     import textwrap
 
+    from .._format import with_unit
     from ..discovery.sentences import verdict_in_words
 
     say(f"Verdict: {verdict_in_words(content)}", bold=True)
@@ -148,8 +95,8 @@ def say_discovery(content: dict[str, Any]) -> None:
         (
             entry["mechanism"],
             f"{entry['statistic']:.1f}",
-            _with_unit(entry["estimate"], ".3g", entry["unit"]),
-            _with_unit(entry["detection_limit"], ".2g", entry["unit"]),
+            with_unit(entry["estimate"], entry["unit"], ".3g"),
+            with_unit(entry["detection_limit"], entry["unit"]),
             f"{entry['probability']:.3f}",
         )
         for entry in content["ranking"][:ROWS]
@@ -163,15 +110,11 @@ def say_discovery(content: dict[str, Any]) -> None:
     say()
 
 
-def _with_unit(value: float | None, form: str, unit: str) -> str:
-    return ("unknown" if value is None else format(value, form)) + ("" if unit == "-" else f" {unit}")
-
-
 @click.command(short_help="Say what a planned campaign could show.")
 @common.campaign
 @common.out(required=True)
 @common.exclude
-@common.leave_out
+@common.leave_out()
 @common.threshold(default=0.0)
 @common.priors()
 @common.law
@@ -189,20 +132,19 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
       mcc-jax power planned --out planned
     """
     with session() as progress:
+        from .. import arguments
+        from .._format import with_unit
         from ..discovery import power_of_campaign
         from ..effects import LIBRARY
 
-        require_mechanisms(options["exclude"])
+        library = dict(LIBRARY)
+        for name in options["exclude"]:
+            arguments.choice(name, library, "mechanism")
+            library.pop(name)
         data = read_without(campaign, options["leave_out"], progress)
         with results(out) as stage:
-            found = power_of_campaign(
-                data,
-                library={name: m for name, m in LIBRARY.items() if name not in options["exclude"]},
-                model=joint_model(options),
-                threshold_MPa=options["threshold_MPa"],
-                progress=progress,
-            )
-            content = found.to_json()
+            settings: dict[str, Any] = {"model": joint_model(options), "threshold_MPa": options["threshold_MPa"]}
+            content = power_of_campaign(data, library=library, progress=progress, **settings).to_json()
             (stage.folder / POWER).write_text(json_text(content), encoding="utf-8")
     if as_json:
         say_json(content)
@@ -210,7 +152,7 @@ def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
     rows = []
     for entry in content["mechanisms"]:
         ends = entry["detection_limit"], entry["plausible"][1]
-        limits = (_with_unit(value, ".2g", entry["unit"]) for value in ends)
+        limits = (with_unit(value, entry["unit"]) for value in ends)
         rows.append((entry["mechanism"], *limits, "yes" if entry["visible"] else "no"))
     say_table(("mechanism", "found from", "largest plausible", "can be seen"), rows)
     for entry in content["untestable"]:

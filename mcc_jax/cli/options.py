@@ -62,14 +62,25 @@ class Location(click.Path):
 campaign = click.argument("campaign", type=Location(), metavar="CAMPAIGN")
 
 
+def option(name: str, metavar: str, kind: Any, help: str, *, variable: str = "", **settings: Any) -> Any:
+    """An option whose variable is spelt as the option is: click would write it in lower case."""
+    variable = variable or name[2:].replace("-", "_")
+    return click.option(name, variable, type=kind, metavar=metavar, help=help, **settings)
+
+
+def one_of(name: str, choices: tuple[str, ...], help: str, **settings: Any) -> Any:
+    """An option that takes one of several words, the first if it is not given."""
+    return click.option(name, type=click.Choice(choices), default=choices[0], show_default=True, help=help, **settings)
+
+
 def out(**settings: Any) -> Any:
     """`--out DIR`."""
-    return click.option("--out", metavar="DIR", type=Location(), help="Folder for the results.", **settings)
+    return option("--out", "DIR", Location(), "Folder for the results.", **settings)
 
 
 def seed(help: str = "Seed of all draws.") -> Any:
     """`--seed`."""
-    return click.option("--seed", type=whole_number, default=0, show_default=True, metavar="N", help=help)
+    return option("--seed", "N", whole_number, help, default=0, show_default=True)
 
 
 no_seed = click.option("--seed", type=whole_number, hidden=True, expose_value=False)
@@ -84,24 +95,28 @@ def diameters(help: str) -> Any:
             raise click.BadParameter("it is empty.", ctx, param)
         return value
 
-    return click.option("--diameters", metavar="D1,D2,D3|FILE", callback=given, help=help)
+    return option("--diameters", "D1,D2,D3|FILE", str, help, callback=given)
 
 
 def threshold(use: str = ": points below it do not count.", default: float = 0.2) -> Any:
     """`--threshold-MPa`; `use` says what it does."""
     text = f"Stress below which only surface asperities deform{use}"
-    settings = {"type": NOT_NEGATIVE, "metavar": "MPa", "default": default, "show_default": True}
-    return click.option("--threshold-MPa", "threshold_MPa", help=text, **settings)
+    return option("--threshold-MPa", "MPa", NOT_NEGATIVE, text, default=default, show_default=True)
 
 
 def priors(**settings: Any) -> Any:
     """`--priors FILE`."""
-    return click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.", **settings)
+    return option("--priors", "FILE", Location(), "TOML file of priors.", **settings)
 
 
-def one_of(name: str, choices: tuple[str, ...], help: str, **settings: Any) -> Any:
-    """An option that takes one of several words, the first if it is not given."""
-    return click.option(name, type=click.Choice(choices), default=choices[0], show_default=True, help=help, **settings)
+def effect(metavar: str, help: str, **settings: Any) -> Any:
+    """`--effect`, which may be repeated."""
+    return option("--effect", metavar, str, help, variable="effects", multiple=True, **settings)
+
+
+def leave_out(help: str = "Leave this particle out; may be given several times.") -> Any:
+    """`--leave-out`, which may be repeated."""
+    return option("--leave-out", "NAME", str, help, multiple=True)
 
 
 def law(command: Any) -> Any:
@@ -116,12 +131,7 @@ def law(command: Any) -> Any:
     return unloading(scaling(command))
 
 
-exclude = click.option(
-    "--exclude", multiple=True, metavar="NAME", help="Mechanism to exclude from the search; repeatable."
-)
-leave_out = click.option(
-    "--leave-out", multiple=True, metavar="NAME", help="Leave this particle out; may be given several times."
-)
+exclude = option("--exclude", "NAME", str, "Mechanism to exclude from the search; repeatable.", multiple=True)
 no_figures = click.option("--no-figures", is_flag=True, help="Draw no figures.")
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from .._store import results
 from . import options as common
-from .session import say, say_files, sentence, session
+from .printing import say, say_files, sentence
+from .session import session
 
 REPORT = "report.html"
 FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
@@ -17,9 +19,7 @@ FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
 @click.command(short_help="One page that shows all results.")
 @click.argument("folder", type=common.Location(), metavar="DIR")
 @common.out()
-@click.option(
-    "--campaign", type=common.Location(), metavar="CAMPAIGN", help="Folder of the tests, if the results do not know it."
-)
+@common.option("--campaign", "CAMPAIGN", common.Location(), "Folder of the tests, if the results do not know it.")
 @common.no_seed
 def report(folder: Path, out: Path | None, campaign: Path | None) -> None:
     """Write one self-contained HTML page from what is in the folder DIR: a campaign, calibration.json with
@@ -52,7 +52,7 @@ def report(folder: Path, out: Path | None, campaign: Path | None) -> None:
 @click.argument("directory", type=common.Location(), metavar="DIR")
 @click.option("--format", "form", type=click.Choice(FORMATS), required=True, help="What to write; see below.")
 @common.out(required=True)
-@click.option("--particle", metavar="NAME", help="Take this particle's coefficients instead of the population's.")
+@common.option("--particle", "NAME", str, "Take this particle's coefficients instead of the population's.")
 @common.diameters(
     "Diameters in um of the particle that the golden table shows, or a table of particles (its row of that particle, "
     "or its mean).  [default: the particles of the calibrated campaign]"
@@ -61,15 +61,7 @@ def report(folder: Path, out: Path | None, campaign: Path | None) -> None:
     "--allow-not-monotone", is_flag=True, help="Export a law whose stress falls on loading, instead of refusing it."
 )
 @common.seed("Seed of the random paths in the golden table.")
-def export(
-    directory: Path,
-    form: str,
-    out: Path,
-    particle: str | None,
-    diameters: str | None,
-    allow_not_monotone: bool,
-    seed: int,
-) -> None:
+def export(directory: Path, form: str, out: Path, seed: int, **options: Any) -> None:
     """Write the law that a calibration of any method, or a discovery, wrote into DIR, for use in other engines.
 
     Takes the population's law, each coefficient at its median exp(mean of log C), or one particle's. Next to every
@@ -93,13 +85,11 @@ def export(
         from ..export import read_calibration, write_export
 
         progress("reading the calibration")
-        law, shown, origin = read_calibration(
-            directory, particle=particle, diameters=diameters, allow_not_monotone=allow_not_monotone
-        )
+        law, shown, origin = read_calibration(directory, **options)
         progress("writing")
         with results(out) as stage:
             files = write_export(form, law, shown, stage.folder, origin=origin, seed=seed)
-    whose = "the population" if particle is None else f"particle {particle}"
+    whose = "the population" if options["particle"] is None else f"particle {options['particle']}"
     say(
         f"Law of {whose}: unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}, "
         f"C1 {float(law.plastic.C1):.4g}, C3 {float(law.plastic.C3):.4g}, C5 {float(law.plastic.C5):.4g}, "

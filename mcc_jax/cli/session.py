@@ -1,4 +1,4 @@
-"""What commands do around their work: precision, progress, the campaign, the model, figures, files, printing."""
+"""What commands do around their work: precision, progress, the campaign, the model, the files of a result."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from .._errors import InputError
-from .._store import Stage, json_text
+from .._extras import extra
+from .._store import Stage
 from ..files import RESULT_BYTES, read_regular
 
 if TYPE_CHECKING:
     from .._types import Progress
-    from ..calibrate import Model
+    from ..calibrate import LeastSquares, Model, PaperCalibration, Posterior
     from ..campaign import Campaign
+    from ..discovery import Discovery
+
+    type Calibration = PaperCalibration | LeastSquares | Posterior
 
 PROGRAM = "mcc-jax"
 DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
-FIGURES = "figures"
+FIGURES, POSTERIOR = "figures", "posterior.nc"
 OWN_FILES = re.compile(rf"{FIGURES}/[A-Za-z0-9_-]+\.png|posterior\.nc|calibration\.msgpack")
 PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy", "scipy")
 
@@ -148,41 +150,13 @@ def _logged(stream: Any) -> Iterator[Progress]:
             timer.join()
 
 
-def say(text: str = "", **style: Any) -> None:
-    """Print a line on standard output; colours go to terminals only."""
-    click.secho(text, **style)
-
-
-def say_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    """Print a small table, the first column to the left and the others to the right."""
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
-
-    def line(row: tuple[str, ...]) -> str:
-        first, *others = zip(row, widths, strict=True)
-        return "  ".join(["", first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]).rstrip()
-
-    say(line(header), bold=True)
-    for row in rows:
-        say(line(row))
-
-
 def read_without(folder: Path, left_out: tuple[str, ...], progress: Progress) -> Campaign:
     """The campaign in a folder without the particles of `--leave-out`."""
     from ..campaign import read_campaign
 
     progress("reading the campaign")
     campaign = read_campaign(folder)
-    for name in left_out:
-        require_particle(name, campaign, "--leave-out")
     return campaign.without(*left_out) if left_out else campaign
-
-
-def require_particle(name: str, campaign: Campaign, option: str) -> None:
-    """Refuse a particle that is not there, before anything is computed. Raises `InputError` naming those that are."""
-    names = campaign.particles
-    if name not in names:
-        remedy = f"{option} takes one of: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
-        raise InputError(f"there is no particle {name!r}", file=campaign.source or None, remedy=remedy)
 
 
 def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, shape_scatter: bool = False) -> Model:
@@ -205,10 +179,7 @@ def provenance(
     from .._version import __version__
     from ..campaign import file_checksums
 
-    settings = {
-        name: value.name if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
-        for name, value in settings.items()
-    }
+    settings = {name: value.name if isinstance(value, Path) else value for name, value in settings.items()}
     versions = {"mcc_jax": __version__, "python": platform.python_version(), **{n: version(n) for n in PACKAGES}}
     return {
         "campaign": {"folder": folder or str(campaign.resolve()), "sha256": file_checksums(campaign)},
@@ -226,39 +197,37 @@ def drop_earlier(stage: Stage, result: str, names: Sequence[str]) -> None:
         stage.stale += [name for name in own if name not in names]
 
 
-def write_figures(stage: Stage, draw: Callable[[], Mapping[str, Any]] | None, progress: Progress) -> list[str]:
-    """Draw into the stage, unless `draw` is None; the figures' names."""
-    progress("writing" if draw is None else "drawing the figures")
-    if draw is None:
-        return []
-    from ..plots import save_figures
+def write_result(
+    result: Calibration | Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
+) -> dict[str, Any]:
+    """Write a calibration or a discovery, its figures and, if it is one, the posterior into the stage.
 
+    `origin` is what `provenance` gives. Returns the contents of the JSON.
+    """
+    from ..calibrate import Posterior
+
+    progress("drawing the figures" if figures else "writing")
+    names = _write_figures(result, stage) if figures else []
+    files = [result.archive_file]
+    if isinstance(result, Posterior):
+        progress("writing the posterior")
+        with extra("netcdf"):
+            import h5netcdf  # noqa: F401
+            import h5py  # noqa: F401
+        result.to_arviz(seed=result.seed).to_netcdf(stage.folder / POSTERIOR, engine="h5netcdf")
+        files.append(POSTERIOR)
+    drop_earlier(stage, result.content_file, [*names, *files])
+    return result.write(stage.folder, figures=names, files=files, provenance=dict(origin))
+
+
+def _write_figures(result: Any, stage: Stage) -> list[str]:
+    from .. import plots
+
+    draw = {
+        "PaperCalibration": plots.paper_figures,
+        "LeastSquares": plots.least_squares_figures,
+        "Posterior": plots.posterior_figures,
+        "Discovery": plots.discovery_figures,
+    }[type(result).__name__]
     (stage.folder / FIGURES).mkdir(exist_ok=True)
-    return sorted(f"{FIGURES}/{path.name}" for path in save_figures(draw(), stage.folder / FIGURES))
-
-
-def say_json(content: dict[str, Any]) -> None:
-    """Print a result as it is in its file: JSON is UTF-8, whatever the terminal's encoding."""
-    click.echo(json_text(content).encode(), nl=False)
-
-
-def say_files(directory: Path, names: list[str]) -> None:
-    """Print what was written where; figures are counted, not listed."""
-    figures = [name for name in names if name.startswith(f"{FIGURES}/")]
-    say(f"Written into {directory}:")
-    for name in (name for name in names if name not in figures):
-        say(f"  {name}")
-    if figures:
-        say(f"  {FIGURES}/ ({len(figures)} png)")
-
-
-def say_next(*steps: tuple[str, str]) -> None:
-    """Print what to run next: a command and what it is for each; a step without a command is left out."""
-    for place, (command, purpose) in enumerate(step for step in steps if step[0]):
-        say(f"{'Next:' if place == 0 else '     '} {command}", nl=False)
-        say(f"   # {purpose}", dim=True)
-
-
-def sentence(text: str) -> str:
-    """A text as a sentence: a capital at its beginning, one full stop at its end."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+    return sorted(f"{FIGURES}/{path.name}" for path in plots.save_figures(draw(result), stage.folder / FIGURES))

@@ -3,7 +3,6 @@
 Nothing is registered with pyplot.
 """
 
-from .curves import particle_pages as particle_pages
 from .curves import plot_bands as plot_bands
 from .curves import plot_before_after as plot_before_after
 from .curves import plot_fits as plot_fits

@@ -90,10 +90,8 @@ def _draw_unused(ax: Axes, curve: FittedCurve) -> None:
 
 def _quality(curve: FittedCurve, law_um: np.ndarray) -> str:
     """How well a curve is met: the share of points in the band, where there is one, or the rms residual of a law."""
-    known = curve.used & np.isfinite(curve.low_um)
-    if known.any():
-        inside = (curve.displacement_um >= curve.low_um) & (curve.displacement_um <= curve.high_um)
-        return f", {100 * np.mean(inside[known]):.0f} % inside"
+    if len(curve.inside):
+        return f", {100 * np.mean(curve.inside):.0f} % inside"
     rms = np.sqrt(np.mean((curve.displacement_um - law_um)[curve.used] ** 2))
     return f", rms {rms:.2g} µm" if np.isfinite(rms) else ""
 
@@ -158,11 +156,6 @@ def plot_fits(calibration: LeastSquares) -> Figure:
     return _draw_kept(calibration, "Measured and fitted", "fitted")
 
 
-def particle_pages(calibration: PaperCalibration) -> int:
-    """Number of pages that `plot_particles` needs for all particles."""
-    return -(-len(calibration.campaign) // PAGE)
-
-
 @style.styled
 def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     """Force [mN] over displacement [um], loading and unloading, one panel per particle, measured and predicted.
@@ -173,9 +166,10 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     with the reason. If the law misses the data altogether, a line below the title says so. Follows the paper's three
     figures of experimental values and predictions.
 
-    Pages count from 1, with at most 20 particles each (`particle_pages` gives their number).
+    Pages count from 1, with at most 20 particles each.
     """
-    pages, count = particle_pages(calibration), len(calibration.campaign)
+    count = len(calibration.campaign)
+    pages = -(-count // PAGE)
     if page not in range(1, pages + 1):
         raise InputError(f"there is no page {page}; there are {pages}, counted from 1")
     chosen = range((page - 1) * PAGE, min(page * PAGE, count))
@@ -189,8 +183,8 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     if any(calibration.curves[i].why_not for i in chosen):
         handles.append(_NOT_USED)
     title = "Measured and predicted" + (f", page {page} of {pages}" if pages > 1 else "")
-    notes = calibration.misfit_notes()
-    return style.finish(figure, calibration.campaign, title=title, warnings=notes, handles=handles)
+    warning = " ".join(calibration.misfit_notes())
+    return style.finish(figure, calibration.campaign, title=title, warning=warning, handles=handles)
 
 
 @style.styled
@@ -241,8 +235,7 @@ def _histogram(ax: Axes, values: np.ndarray, reach: float) -> None:
     ax.stairs(density, edges, orientation="horizontal", fill=True, color=style.PALE, label="residuals")
     x = np.linspace(-reach, reach, 201)
     ax.plot(np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), x, color=style.BLACK, linewidth=1.0, label="normal")
-    ax.set_xlabel("density [-]")
-    ax.set_xlim(left=0)
+    ax.set(xlabel="density [-]", xlim=(0, None))
     ax.legend(loc="upper right", handlelength=1.2)
 
 
@@ -275,8 +268,7 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
             ax.plot(draw, force, color=style.GREY, linewidth=0.6)
         ax.plot(np.median(curves.displacement_um, axis=0)[rows], force, color=style.BLACK, linewidth=1.3)
         ax.set(title=title, xlabel=style.DISPLACEMENT)
-    panels[0].set(ylabel=style.FORCE, ylim=(0, 1.02 * up[-1]))
-    panels[0].set_xlim(left=0)
+    panels[0].set(ylabel=style.FORCE, ylim=(0, 1.02 * up[-1]), xlim=(0, None))
     D1, D2, D3 = sizes.tolist()
     eta = float(calibration.law().shape_factor(Particle(D1, D2, D3)))
     title = f"A new particle of {D1:.0f} × {D2:.0f} × {D3:.0f} µm, $\\eta_p$ = {eta:.2f}"

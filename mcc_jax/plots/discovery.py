@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .._errors import InputError
-from .._format import plain
+from .._format import plain, with_unit
 from ..calibrate.estimates import quantities
 from ..calibrate.population import COEFFICIENTS
 from ..discovery import Discovery
@@ -30,20 +27,15 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
     """Every figure of a discovery that can be drawn, by the stem of its file's name; none without a fit of the law."""
     if found.residuals is None:
         return {}
-    figures = {
-        "discovery_where": plot_where(found),
-        "discovery_before_after": plot_before_after(found),
-        "discovery_ranking": plot_ranking(found),
-        "discovery_similarity": plot_similarity(found),
-    }
+    plots = [plot_where, plot_before_after, plot_ranking, plot_similarity]
     if found.held_out is not None:
-        figures["discovery_gap"] = plot_gap(found)
+        plots.append(plot_gap)
     if found.effects or found.closure is not None:
-        figures["discovery_shifts"] = plot_shifts(found)
+        plots.append(plot_shifts)
+    figures = style.by_stem(plots, found)
     if found.posterior is not None:
-        figures["discovery_bands"] = plot_bands(found.posterior)
-        figures["discovery_prior_posterior"] = plot_prior_posterior(found.posterior)
-    return figures
+        figures |= style.by_stem((plot_bands, plot_prior_posterior), found.posterior)
+    return {f"discovery_{stem}": figure for stem, figure in figures.items()}
 
 
 def _finished(figure: Figure, found: Discovery, **more: Any) -> Figure:
@@ -86,12 +78,8 @@ def plot_where(found: Discovery) -> Figure:
     what = "share of what noise leaves [-]" if nothing else "share of the systematic gap [-]"
     figure.colorbar(colours, ax=ax, label=what)
     title = "Where law and tests disagree" + (": nowhere beyond noise" if nothing else "")
-    warnings = ["These are shares of what noise alone leaves: no gap was found."] if nothing else []
-    return _finished(figure, found, title=title, warnings=warnings)
-
-
-def _with_unit(value: float, unit: str) -> str:
-    return f"{value:.2g}" if unit == "-" else f"{value:.2g} {unit}"
+    warning = "These are shares of what noise alone leaves: no gap was found." if nothing else ""
+    return _finished(figure, found, title=title, warning=warning)
 
 
 @style.styled
@@ -126,8 +114,8 @@ def plot_ranking(found: Discovery) -> Figure:
         ax.barh(row, abs(entry["statistic"]), height=0.66, linewidth=0.9, **kinds[kind])
         chance = f"{entry['probability']:.2f}" if entry["probability"] >= 0.005 else "< 0.01"
         ax.text(1.1, row, chance, ha="right", **column)
-        limit = _with_unit(entry["detection_limit"], unit)
-        ax.text(1.13, row, f"{_with_unit(entry['estimate'], unit)}  (limit {limit})", **column)
+        limit = with_unit(entry["detection_limit"], unit)
+        ax.text(1.13, row, f"{with_unit(entry['estimate'], unit)}  (limit {limit})", **column)
     patch: style.Look = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
     for row, missing in enumerate(found.untestable, start=len(entries)):
         needs = f"needs {missing['needs']}"
@@ -161,8 +149,7 @@ def plot_similarity(found: Discovery) -> Figure:
     names, both = found.likeness.names[:count], found.likeness.correlation[:count, :count]
     figure = style.new_figure(3.6 + 0.42 * count, 2.6 + 0.36 * count)
     ax = figure.subplots()
-    colours = ScalarMappable(Normalize(-1, 1), colormaps["PuOr_r"])
-    ax.imshow(both, cmap=colours.cmap, vmin=-1, vmax=1, aspect="auto")
+    colours = ax.imshow(both, cmap="PuOr_r", vmin=-1, vmax=1, aspect="auto")
     for (i, j), value in np.ndenumerate(both):
         ink, words = "white" if abs(value) > 0.65 else style.BLACK, f"{value:.2f}".replace("-0.00", "0.00")
         ax.text(j, i, words, ha="center", va="center", fontsize=7, color=ink)
@@ -187,13 +174,8 @@ def plot_gap(found: Discovery) -> Figure:
     steps = gap["steps"]
     figure = style.new_figure(7.6, 3.2)
     left, right = figure.subplots(1, 2)
-    if not steps:
-        reason = "no gap was found" if found.verdict == "NO_GAP" else "held-out particles were not asked for"
-        for ax in (left, right):
-            style.empty(ax, reason)
-        return _finished(figure, found, title="The gap on held-out particles")
-    labels = ["law alone", *(f"+ {plain(s['added'])}" for s in steps[1:])]
-    colours = [style.VERMILION, *([style.BLUE] * (len(steps) - 1))]
+    labels = ["law alone" if step["added"] is None else f"+ {plain(step['added'])}" for step in steps]
+    colours = [style.VERMILION if step["added"] is None else style.BLUE for step in steps]
     for ax, key, label, form, floor in (
         (left, "chi2_per_dof", "χ² per point [-]", "{:.2f}", 1.0),
         (right, "systematic_um", "systematic gap [µm]", "{:.2g}", 0.0),
@@ -206,7 +188,8 @@ def plot_gap(found: Discovery) -> Figure:
     if gap["closed_fraction"] is not None:
         style.note(right, f"{100 * gap['closed_fraction']:.0f} % of the gap closed", place="upper right")
     handles = [Line2D([], [], label="floor: noise alone", **_FLOOR)]
-    return _finished(figure, found, title="The gap on held-out particles, each left out in turn", handles=handles)
+    what = ", each left out in turn" if steps else ": no gap was found, or they were not asked for"
+    return _finished(figure, found, title=f"The gap on held-out particles{what}", handles=handles)
 
 
 @style.styled

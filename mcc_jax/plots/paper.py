@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,19 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import ScalarFormatter
 
-from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ..calibrate.data import UNLOADED_FROM
-from ..calibrate.paper_steps import MasterCurve
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style
-from .curves import particle_pages, plot_particles
+from .curves import PAGE, plot_particles
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-_CYCLE = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
 _DOTTED: style.Look = {"color": style.GREY, "linewidth": 0.8, "dashes": (1, 1.5)}
 _DASHED: style.Look = {"dashes": (3.5, 1.8)}
 _MEAN: style.Look = {
@@ -40,17 +31,13 @@ _SMALL: style.Look = {"fontsize": 7, "color": style.GREY}
 
 def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     """Every figure of the calibration by the stem of its file's name; more than 20 particles take several pages."""
-    pages = range(1, particle_pages(calibration) + 1)
-    return {
-        "curves": plot_curves(calibration),
-        "dimensions": plot_dimensions(calibration.campaign),
-        "collapse": plot_collapse(calibration),
-        "master": plot_master(calibration),
-        "law": plot_law(calibration),
-        **{"particles" if page == 1 else f"particles_{page}": plot_particles(calibration, page) for page in pages},
-        "elastic": plot_elastic(calibration),
-        "residuals": plot_residuals(calibration),
-    }
+    figures = style.by_stem(
+        (plot_curves, plot_collapse, plot_master, plot_law, plot_elastic, plot_residuals), calibration
+    )
+    figures["dimensions"] = plot_dimensions(calibration.campaign)
+    for page in range(1, -(-len(calibration.campaign) // PAGE) + 1):
+        figures["particles" if page == 1 else f"particles_{page}"] = plot_particles(calibration, page)
+    return figures
 
 
 # ---- raw and adjusted curves -----------------------------------------------------------------------------------------
@@ -70,54 +57,40 @@ def adjusted_curve(calibration: PaperCalibration, index: int) -> tuple[np.ndarra
     return np.concatenate([corner[0], strain[first:]]), np.concatenate([corner[1], stress[first:]])
 
 
-def _chosen(calibration: PaperCalibration, particles: Sequence[str] | None, eta: np.ndarray) -> list[int]:
-    if particles is None:
-        kept = np.flatnonzero(calibration.adjustment.kept)
-        by_shape = kept[np.argsort(eta[kept], kind="stable")]
-        return list(dict.fromkeys(by_shape[[0, len(kept) // 2, -1]].tolist()))
-    if isinstance(particles, str) or not particles:
-        raise InputError(f"particles must be a list of names, got {particles!r}")
-    return [calibration.campaign.index(name) for name in particles]
-
-
 @style.styled
-def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None = None) -> Figure:
+def plot_curves(calibration: PaperCalibration) -> Figure:
     """Stress [MPa] over strain [-] of some tests, loading and unloading, before and after the offset step.
 
     Solid: as measured, from first contact. Dashed: after the offset step, with its straight line up to the threshold,
-    which the right panel enlarges; particles that were not kept have no dashed line. Follows the paper's figure of raw
-    and adjusted curves. By default up to three kept particles over the range of shape factors are shown; more than
-    seven are coloured by shape factor.
+    which the right panel enlarges. Up to three kept particles are shown: of the smallest, the median and the largest
+    shape factor. Follows the paper's figure of raw and adjusted curves.
     """
     campaign, adjustment, eta = calibration.campaign, calibration.adjustment, style.shape_factors(calibration)
-    threshold = adjustment.threshold_MPa
-    chosen, labels = _chosen(calibration, particles, eta), style.particle_labels(campaign.particles)
-    many = len(chosen) > len(_CYCLE)
-    colours = style.sequential(eta[chosen])
+    threshold, labels = adjustment.threshold_MPa, style.particle_labels(campaign.particles)
+    kept = np.flatnonzero(adjustment.kept)
+    by_shape = kept[np.argsort(eta[kept], kind="stable")]
+    chosen = dict.fromkeys(by_shape[[0, len(kept) // 2, -1]].tolist())
     figure = style.new_figure(7.6, 3.9)
     whole, toe = figure.subplots(1, 2, width_ratios=[1.45, 1])
     handles: list[Line2D] = []
-    ends, width = [0.0, 4 * adjustment.strain], style.faintness(len(chosen))
-    for i, colour in zip(chosen, colours.to_rgba(eta[chosen]) if many else _CYCLE, strict=False):
-        kept = adjustment.kept[i]
+    ends = [0.0, 4 * adjustment.strain]
+    for i, colour in zip(chosen, (style.BLUE, style.VERMILION, style.GREEN), strict=False):
+        look = {"color": colour} | style.faintness(len(chosen))
         stress, strain = stress_and_strain(campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i])
         for ax in (whole, toe):
-            ax.plot(strain, stress, color=colour, **width)
-            if kept and threshold > 0:
-                ax.plot(*adjusted_curve(calibration, i), color=colour, **_DASHED, **width)
+            ax.plot(strain, stress, **look)
+            if threshold > 0:
+                ax.plot(*adjusted_curve(calibration, i), **_DASHED, **look)
         passed = int(np.argmax(stress > 3 * threshold)) or len(stress)
         ends += strain[:passed][stress[:passed] > threshold / 4].tolist()
-        suffix = "" if kept else ", not used"
-        handles.append(Line2D([], [], color=colour, label=f"{labels[i]}{suffix} ($\\eta_p$ = {eta[i]:.2f})"))
-    styles = [Line2D([], [], color=style.GREY, label="as measured")]
+        handles.append(Line2D([], [], color=colour, label=f"{labels[i]} ($\\eta_p$ = {eta[i]:.2f})"))
+    handles.append(Line2D([], [], color=style.GREY, label="as measured"))
     if threshold > 0:
-        styles.append(Line2D([], [], color=style.GREY, label="adjusted", **_DASHED))
-    if many:
-        figure.colorbar(colours, ax=toe, label=style.SHAPE_FACTOR)
-    whole.legend(handles=styles if many else handles + styles, loc="upper left")
-    whole.set_ylim(bottom=min(0.0, whole.dataLim.ymin))
-    whole.set(title="whole test", xlabel=style.STRAIN, ylabel=style.STRESS)
-    toe.set(xlabel=style.STRAIN, ylabel=style.STRESS)
+        handles.append(Line2D([], [], color=style.GREY, label="adjusted", **_DASHED))
+    whole.legend(handles=handles, loc="upper left")
+    whole.set(title="whole test", ylim=(min(0.0, whole.dataLim.ymin), None))
+    for ax in (whole, toe):
+        ax.set(xlabel=style.STRAIN, ylabel=style.STRESS)
     if threshold > 0:
         for ax in (whole, toe):
             ax.axhline(threshold, **_DOTTED)
@@ -133,17 +106,6 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
 # ---- dimensions ------------------------------------------------------------------------------------------------------
 
 
-def dimensions(campaign: Campaign) -> pd.DataFrame:
-    """Average diameter (D1 + D2 + D3)/3 and effective diameter D1 D2 / D3 [um] of every particle, and their ratios."""
-    import pandas as pd
-
-    average, (D1, D2, D3) = campaign.diameters_um.mean(axis=1), campaign.diameters_um.T
-    sizes = pd.DataFrame({"average_um": average, "effective_um": D1 * D2 / D3})
-    sizes["effective_over_average"] = sizes.effective_um / average
-    sizes["average_over_effective"] = average / sizes.effective_um
-    return sizes
-
-
 @style.styled
 def plot_dimensions(campaign: Campaign) -> Figure:
     """Effective diameter D_e = D1 D2 / D3 over average diameter (D1 + D2 + D3)/3 [um], one point per particle.
@@ -151,10 +113,9 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     With the line 1:1, the line through the origin fitted to the data, and the mean ratio both ways with its standard
     deviation; for the paper's own table these are 1.31 and 0.78, not 1.5. Flat particles lie high.
     """
-    sizes = dimensions(campaign)
-    average, effective = sizes.average_um.to_numpy(), sizes.effective_um.to_numpy()
+    D1, D2, D3 = campaign.diameters_um.T
+    average, effective, flat = campaign.diameters_um.mean(axis=1), D1 * D2 / D3, D3 / np.sqrt(D1 * D2)
     slope = float(average @ effective / (average @ average))
-    flat = campaign.diameters_um[:, 2] / np.sqrt(campaign.diameters_um[:, 0] * campaign.diameters_um[:, 1])
     colours = style.sequential(flat)
     figure = style.new_figure(5.2, 4.4)
     ax = figure.subplots()
@@ -170,11 +131,11 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     ax.set_ylabel("effective diameter $D_e = D_1 D_2/D_3$ [µm]")
     ax.legend(loc="upper left")
     lines = []
-    for name, column in (("$D_e$/average", "effective_over_average"), ("average/$D_e$", "average_over_effective")):
-        ratio = sizes[column]
-        lines.append(f"mean of {name}: {ratio.mean():.2f}" + (f" ± {ratio.std():.2f}" if len(ratio) > 1 else ""))
-    if len(sizes) > 2 and sizes.average_um.nunique() > 1 and sizes.effective_um.nunique() > 1:
-        lines.append(f"correlation: {sizes.average_um.corr(sizes.effective_um):.2f}")
+    for name, ratio in (("$D_e$/average", effective / average), ("average/$D_e$", average / effective)):
+        sd = f" ± {ratio.std(ddof=1):.2f}" if len(ratio) > 1 else ""
+        lines.append(f"mean of {name}: {ratio.mean():.2f}{sd}")
+    if len(campaign) > 2 and np.ptp(average) > 0 and np.ptp(effective) > 0:
+        lines.append(f"correlation: {np.corrcoef(average, effective)[0, 1]:.2f}")
     style.note(ax, "\n".join(lines), place="lower right")
     return style.finish(figure, campaign)
 
@@ -207,14 +168,12 @@ def plot_collapse(calibration: PaperCalibration) -> Figure:
         mean = (factors[:, None] * table.strain[:, everyone]).mean(axis=0)
         dashes: style.Look = {"color": style.BLACK, "linewidth": 1.8, "dashes": (2.5, 1.2)}
         ax.plot(mean, table.stress_MPa[everyone], label="mean of all particles", **dashes)
-        ax.set_xlim(left=0)
-        ax.set(xlabel=label, title=title)
+        ax.set(xlabel=label, title=title, xlim=(0, None))
         ax.legend(loc="upper left", title=f"objective {value:.4g}", alignment="left", title_fontsize=8)
-    panels[0].set_ylim(bottom=0)
-    panels[0].set_ylabel(style.STRESS)
+    panels[0].set(ylabel=style.STRESS, ylim=(0, None))
     figure.colorbar(colours, ax=panels.tolist(), label=style.SHAPE_FACTOR)
-    warnings = [f"the fit of a did not succeed: {fit.reason}"] if fit.reason else []
-    return style.finish(figure, calibration.campaign, warnings=warnings)
+    warning = f"the fit of a did not succeed: {fit.reason}" if fit.reason else ""
+    return style.finish(figure, calibration.campaign, warning=warning)
 
 
 @style.styled
@@ -232,11 +191,11 @@ def plot_master(calibration: PaperCalibration) -> Figure:
     labels = ["single particles", *["_"] * (len(eta) - 1)]
     thin = style.faintness(len(eta)) | {"linewidth": 0.6}
     upper.plot(table.stress_MPa, single.T, color=style.PALE, label=labels, **thin)
-    upper.fill_between(master.stress_MPa, *_sample_band(master), label="mean ± 1 sd", **_BAND)
+    low, high = master.mean - master.sd, master.mean + master.sd
+    upper.fill_between(master.stress_MPa, low, high, label="mean ± 1 sd", **_BAND)
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
     upper.plot(master.stress_MPa, master.mean, markevery=step, label="mean", **_MEAN)
-    upper.set_ylim(bottom=0)
-    upper.set_ylabel(style.SCALED_STRAIN)
+    upper.set(ylabel=style.SCALED_STRAIN, ylim=(0, None))
     upper.legend(loc="lower right")
     style.note(upper, f"a = {calibration.a:.2f}, {len(eta)} particles")
     lower.fill_between(table.stress_MPa, table.reached.sum(axis=0), step="mid", color=style.PALE, linewidth=0)
@@ -247,11 +206,6 @@ def plot_master(calibration: PaperCalibration) -> Figure:
     lower.set(xlim=(0, 1.02 * table.stress_MPa[-1]), ylim=(0, 1.12 * len(eta)))
     lower.set(xlabel=style.STRESS, ylabel="particles [-]")
     return style.finish(figure, calibration.campaign)
-
-
-def _sample_band(master: MasterCurve) -> tuple[np.ndarray, np.ndarray]:
-    """One standard deviation around the mean scaled strain; NaN where it is unknown."""
-    return master.mean - master.sd, master.mean + master.sd
 
 
 def law_strain(calibration: PaperCalibration) -> np.ndarray:
@@ -288,7 +242,8 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     figure = style.new_figure(5.6, 4.3)
     ax = figure.subplots()
     ax.axvspan(tested, right, color="#ECECEC", linewidth=0, label="beyond the tests")
-    ax.fill_betweenx(master.stress_MPa, *_sample_band(master), label="sample mean ± 1 sd of strain", **_BAND)
+    low, high = master.mean - master.sd, master.mean + master.sd
+    ax.fill_betweenx(master.stress_MPa, low, high, label="sample mean ± 1 sd of strain", **_BAND)
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
     ax.plot(master.mean, master.stress_MPa, markevery=step, label="sample mean", **_MEAN)
     law: style.Look = {"color": style.VERMILION, "linewidth": 1.0}

@@ -29,16 +29,10 @@ NEAR_DRAWS = 100  # from so many draws near a posterior on, the prior's density 
 _SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
 _PAPER: style.Look = {"color": style.VERMILION, "dashes": (3, 1.5)}
 
-
 LABELS = {
     "a": "$a$ [-]",
     "effective_modulus_MPa": "$\\bar{E}$ [GPa]",
-    "mu_C1": "$\\mu_1$ [-]",
-    "tau_C1": "$\\tau_1$ [-]",
-    "mu_C3": "$\\mu_3$ [-]",
-    "tau_C3": "$\\tau_3$ [-]",
-    "mu_C5": "$\\mu_5$ [-]",
-    "tau_C5": "$\\tau_5$ [-]",
+    **{f"{name}_C{k}": f"$\\{name}_{k}$ [-]" for k in (1, 3, 5) for name in ("mu", "tau")},
     "modulus_scatter": "$s_E$ [-]",
     "shape_scatter": "$s_a$ [-]",
     "noise_factor": "noise factor [-]",
@@ -57,13 +51,12 @@ MEANINGS = {
 def posterior_figures(calibration: Posterior) -> dict[str, Figure]:
     """Every figure of the posterior, by the stem of its file's name: `pairs` for `plot_pairs`."""
     plots = (plot_pairs, plot_prior_posterior, plot_forest, plot_shrinkage, plot_bands, plot_new_particle)
-    return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
+    return style.by_stem(plots, calibration)
 
 
 def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
     """Every figure of the joint least squares, by the stem of its file's name: `fits` for `plot_fits`."""
-    plots = (plot_whitened, plot_fits, plot_estimates)
-    return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
+    return style.by_stem((plot_whitened, plot_fits, plot_estimates), calibration)
 
 
 # ---- the population --------------------------------------------------------------------------------------------------

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from .._extras import extra
 from ..calibrate import LeastSquares, PaperCalibration, Posterior
-from ..campaign import Campaign, Metadata
+from ..campaign import Campaign
 
 with extra("plots"):  # every other file of the package imports this one or `curves` first
     from matplotlib import colormaps
@@ -24,15 +25,12 @@ with extra("plots"):  # every other file of the package imports this one or `cur
     from matplotlib.offsetbox import AnchoredText
     from matplotlib.style import context
 
-
 CURVE_POINTS = 100  # about so many points of a curve are drawn, so that dots do not overlap
 MEAN_MARKERS = 32  # about so many symbols on a mean curve
 THIN_CURVES = 30  # of more curves in one panel, lines are thin and faint
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
-"""Okabe and Ito's palette, distinguishable by colour-blind readers."""
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
+"""Of Okabe and Ito's palette, distinguishable by colour-blind readers."""
 GREY, PALE = "#767676", "#B8B8B8"
 
 STRAIN = "strain $\\varepsilon$ [-]"
@@ -66,9 +64,13 @@ RC: dict[Any, Any] = {
 type Look = dict[str, Any]
 """Keywords of what is drawn."""
 
-
 styled = context(["default", RC])
 """Decorator: the function runs under these settings and leaves the caller's as they were."""
+
+
+def by_stem(plots: Iterable[Callable[[Any], Figure]], result: Any) -> dict[str, Figure]:
+    """What these functions draw of a result, by the stem of the file's name: `pairs` for `plot_pairs`."""
+    return {plot.__name__.removeprefix("plot_"): plot(result) for plot in plots}
 
 
 @styled
@@ -86,10 +88,8 @@ def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: i
 def plain(text: str, longest: int = 24) -> str:
     """Any text as one short line that matplotlib draws literally, and as well as its font can."""
     font = get_font(findfont(FONT))
-    visible = "".join(c if c.isprintable() else " " for c in text)
-    drawn = "".join(
-        c if font.get_char_index(ord(c)) else "\N{REPLACEMENT CHARACTER}" for c in " ".join(visible.split())
-    )
+    words = "".join(c if c.isprintable() else " " for c in text).split()
+    drawn = "".join(c if font.get_char_index(ord(c)) else "\N{REPLACEMENT CHARACTER}" for c in " ".join(words))
     if len(drawn) > longest:
         head = longest // 2
         drawn = drawn[:head].rstrip() + "…" + drawn[len(drawn) - (longest - head - 1) :].lstrip()
@@ -99,18 +99,9 @@ def plain(text: str, longest: int = 24) -> str:
 def particle_labels(names: Sequence[str], longest: int = 24) -> list[str]:
     """Names of particles for a figure, all different: with their position in the campaign where two look the same."""
     labels = [f"particle {name}" if name.isdecimal() and len(name) < 8 else plain(name, longest) for name in names]
-    repeated = {label for label in labels if labels.count(label) > 1} if len(set(labels)) < len(labels) else set()
-    return [
-        f"{label} (no. {i})".strip()
-        if not label or label in repeated or "\N{REPLACEMENT CHARACTER}" in label
-        else label
-        for i, label in enumerate(labels, start=1)
-    ]
-
-
-def is_simulated(metadata: Metadata) -> bool:
-    """Whether the metadata say that nobody measured these data."""
-    return "simulation" in metadata.other or "not a measurement" in (metadata.provenance or "")
+    ambiguous = {label for label, count in Counter(labels).items() if count > 1 or "\N{REPLACEMENT CHARACTER}" in label}
+    ambiguous.add("")
+    return [f"{label} (no. {i})".strip() if label in ambiguous else label for i, label in enumerate(labels, start=1)]
 
 
 # ---- layout ----------------------------------------------------------------------------------------------------------
@@ -154,19 +145,14 @@ def grid(
 
 
 def finish(
-    figure: Figure,
-    campaign: Campaign,
-    *,
-    title: str = "",
-    warnings: Sequence[str] = (),
-    handles: Sequence[Artist] = (),
+    figure: Figure, campaign: Campaign, *, title: str = "", warning: str = "", handles: Sequence[Artist] = ()
 ) -> Figure:
-    """Add a title with warnings below it, a legend below the panels and, for simulated data, a note."""
+    """Add a title with a warning below it, a legend below the panels and, for simulated data, a note."""
     width = int(figure.get_size_inches()[0] * 13)
-    lines = [line for text in warnings for line in textwrap.wrap(text[:1].upper() + plain(text[1:], 400), width)]
+    lines = textwrap.wrap(warning[:1].upper() + plain(warning[1:], 400), width)
     colour = VERMILION if lines else BLACK
     figure.suptitle("\n".join(filter(None, [title, *lines])) or " ", x=0.01, ha="left", fontsize=10.0, color=colour)
-    if is_simulated(campaign.metadata):
+    if campaign.metadata.simulated:
         figure.text(0.99, 0.995, "simulated data", ha="right", va="top", fontsize=SMALL, color=GREY)
     if handles:
         figure.legend(handles=list(handles), loc="outside lower center", ncols=len(handles), columnspacing=1.5)
@@ -183,11 +169,11 @@ def finish_joint(
     reasons = calibration.failures()
     if isinstance(calibration, LeastSquares):
         reasons += [f"the data leave this combination open: {text}" for text in calibration.identifiability.open]
-    warnings = []
+    warning = ""
     if reasons:
         further = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
-        warnings = [f"{'' if calibration.converged else 'not converged: '}{reasons[0]}{further}"]
-    return finish(figure, calibration.campaign, title=title, warnings=warnings, handles=handles)
+        warning = f"{'' if calibration.converged else 'not converged: '}{reasons[0]}{further}"
+    return finish(figure, calibration.campaign, title=title, warning=warning, handles=handles)
 
 
 def note(ax: Axes, text: str, *, place: str = "upper left") -> None:
@@ -234,7 +220,7 @@ def spread_over(count: int, most: int) -> np.ndarray:
 
 
 def every(count: int, most: int) -> slice:
-    """Every so manieth of `count` things, so that at most `most` are left."""
+    """Every n-th of `count` things, so that at most `most` are left."""
     return slice(None, None, max(1, -(-count // most)))
 
 

@@ -136,9 +136,9 @@ def _figure(name: str, across: str, up: str) -> Any:
     return plot
 
 
-def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict[str, Any]:
-    """What the script shows: every particle's columns, and how kinds of segments look."""
-    return {
+def chart(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict[str, Any]:
+    """What the page's script needs: Bokeh's empty figures, every particle's columns, how kinds of segments look."""
+    data = {
         "kinds": [dict(zip(("marker", "colour", "word"), LOOKS[kind], strict=True)) for kind in KINDS],
         "particles": [
             {
@@ -157,6 +157,7 @@ def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) ->
             for one, label, fact in zip(shown, labels, facts, strict=True)
         ],
     }
+    return {"bokeh": chart_items(), "data": data}
 
 
 def _rounded(values: np.ndarray, decimals: int) -> list[float | None] | None:

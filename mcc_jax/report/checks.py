@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -17,7 +17,6 @@ from ..campaign import Finding, campaign_findings, check_plausibility, check_tes
 from ..campaign.findings import worst
 from ..discovery.sentences import NOTHING_MISSING, headline, verdict_in_words, within_noise
 from .read import CALIBRATION, DATA, Results
-from .texts import law_of
 
 Level = Literal["good", "look", "bad", "unknown"]
 RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
@@ -36,7 +35,6 @@ OF_FINDINGS: dict[str, tuple[Level, str]] = {
 }
 OF_VERDICTS: dict[str, Level] = {"NO_GAP": "good", "FIT_NOT_CONVERGED": "bad"}
 """What a verdict means for the law without what was found; "look" if something was."""
-
 
 MEANINGS = {
     "Calibration converged": "Every part of the calibration must meet its own tolerances. If not: the numbers are not "
@@ -81,9 +79,6 @@ def check_results(results: Results, shown: Sequence[FittedCurve] = ()) -> list[C
     ]
     if content is not None:
         found += _calibration(content)
-        if content["method"] == "bayes":
-            found += _sampler(content["diagnostics"])
-        found += _fit(content)
     inside = share_inside(shown)
     if inside is not None:
         level = "good" if INSIDE[0] <= inside <= INSIDE[1] else "look"
@@ -112,8 +107,7 @@ def tested(results: Results) -> tuple[Finding, ...]:
 
 def share_inside(shown: Sequence[FittedCurve]) -> float | None:
     """Share of all compared points inside their band [-]; None without bands."""
-    pairs = [(one.displacement_um, one.low_um, one.high_um, one.used & np.isfinite(one.low_um)) for one in shown]
-    inside = [((um >= low) & (um <= high))[some] for um, low, high, some in pairs]
+    inside = [one.inside for one in shown]
     return float(np.mean(np.concatenate(inside))) if sum(map(len, inside)) else None
 
 
@@ -129,46 +123,31 @@ def _gate(check: str, value: float | int | None, good: float, bad: float, text: 
     return _check(check, level, text, want)
 
 
-def _calibration(content: dict[str, Any]) -> list[Check]:
+def _calibration(content: dict[str, Any]) -> Iterator[Check]:
+    """Whether it converged, on how many particles, by which draws, and how well the law fits."""
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     enough = "good" if used == count >= FEW_PARTICLES else "look" if used >= max(2, count / 2) else "bad"
-    done = content["converged"]
-    return [
-        _check("Calibration converged", "good" if done else "bad", "yes" if done else "no", "yes"),
-        _check("Particles used", enough, f"{used} of {count}", f"all, and at least {FEW_PARTICLES}"),
-    ]
-
-
-def _sampler(d: dict[str, Any]) -> list[Check]:
-    rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
-    k = None if k is None else max(k, d.get("pareto_k_joint") or k)
-    few, least = None if ess is None else -ess, f"at least {LEAST_ESS:.0f}"
-    most = f"at most {MOST_PARETO_K}"
-    return [
-        _gate("Chains agree (R-hat)", rhat, MOST_RHAT, RHAT_BAD, number(rhat), f"at most {MOST_RHAT}"),
-        _gate("Independent draws (bulk ESS)", few, -LEAST_ESS, -ESS_BAD, number(ess), least),
-        _gate("Diverging trajectories", divergences, 0.0, 0.0, number(divergences), "0"),
-        _gate("Fast mode is accurate (Pareto k)", k, MOST_PARETO_K, PARETO_K_BAD, number(k, 2), most),
-    ]
-
-
-def _fit(content: dict[str, Any]) -> list[Check]:
-    d = content["diagnostics"]
-    misfit, noise = d.get("own_misfit"), d.get("noise_share")
+    done, d = content["converged"], content["diagnostics"]
+    yield _check("Calibration converged", "good" if done else "bad", "yes" if done else "no", "yes")
+    yield _check("Particles used", enough, f"{used} of {count}", f"all, and at least {FEW_PARTICLES}")
+    if content["method"] == "bayes":
+        rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
+        k = None if k is None else max(k, d.get("pareto_k_joint") or k)
+        few, least, most = None if ess is None else -ess, f"at least {LEAST_ESS:.0f}", f"at most {MOST_PARETO_K}"
+        yield _gate("Chains agree (R-hat)", rhat, MOST_RHAT, RHAT_BAD, number(rhat), f"at most {MOST_RHAT}")
+        yield _gate("Independent draws (bulk ESS)", few, -LEAST_ESS, -ESS_BAD, number(ess), least)
+        yield _gate("Diverging trajectories", divergences, 0.0, 0.0, number(divergences), "0")
+        yield _gate("Fast mode is accurate (Pareto k)", k, MOST_PARETO_K, PARETO_K_BAD, number(k, 2), most)
     falling = (content.get("probability_not_monotone") or {}).get("value")
-    found = []
-    if misfit is not None:
-        value, want = f"off by {percent(misfit)}", f"at most {percent(GOOD_MISFIT)}"
-        found.append(_gate("The law's form fits", misfit, GOOD_MISFIT, LARGE_MISFIT, value, want))
-    if noise is not None:
-        value, want = f"{percent(noise)} is autocorrelated", f"at most {percent(GOOD_NOISE_SHARE)}"
-        found.append(_gate("What is left is noise", noise, GOOD_NOISE_SHARE, CORRELATED_SHARE, value, want))
-    if falling is not None:
-        value, want = f"{percent(falling)} snap through", f"at most {percent(NOT_MONOTONE)}"
-        found.append(_gate("New particles behave", falling, NOT_MONOTONE, math.inf, value, want))
-    name = "Data determine the parameters"
-    gaps = d.get("open_combinations", [])
-    return found + [Check("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
+    for check, share, text, good, bad in (
+        ("The law's form fits", d.get("own_misfit"), "off by {}", GOOD_MISFIT, LARGE_MISFIT),
+        ("What is left is noise", d.get("noise_share"), "{} is autocorrelated", GOOD_NOISE_SHARE, CORRELATED_SHARE),
+        ("New particles behave", falling, "{} snap through", NOT_MONOTONE, math.inf),
+    ):
+        if share is not None:
+            yield _gate(check, share, good, bad, text.format(percent(share)), f"at most {percent(good)}")
+    for gap in d.get("open_combinations", []):
+        yield Check("bad", "Data determine the parameters", "not all", "all", f"The data leave open: {gap}.")
 
 
 def _data(results: Results) -> Check:
@@ -192,5 +171,4 @@ def _complete(results: Results, found: dict[str, Any]) -> Check:
         False: ("look", "part is missing", "closes a part of the gap; held-out particles still differ from it"),
     }
     level, answer, meaning = answers[within_noise(found["gap"])]
-    law = law_of(results)
-    return Check(level, name, answer, want, f"{law[:1].upper()}{law[1:]} {meaning}.")
+    return Check(level, name, answer, want, f"{results.law.capitalize()} {meaning}.")

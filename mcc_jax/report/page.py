@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 from functools import cache
 from typing import Any
 
@@ -20,25 +19,14 @@ from ..discovery.sentences import headline, verdict_in_words
 from .read import Results
 
 with extra("report"):
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup, escape
+
     from ..plots.style import particle_labels
-    from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
+    from . import texts
+    from .chart import LOOKS, chart, chart_scripts, compare
     from .checks import Check, check_results, share_inside, tested
-    from .story import data_uri, example_of, example_pictures, tiles
-    from .texts import (
-        METHODS,
-        calibration_sentences,
-        changes,
-        equation,
-        is_law_alone,
-        law_of,
-        measured,
-        next_steps,
-        particle_facts,
-        particle_rows,
-        quantity,
-        simulated,
-        spread,
-    )
+    from .story import cards, data_uri, example_of, example_pictures
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -59,7 +47,7 @@ CAPTIONS = {
     "shrinkage": ("posterior", "Each particle alone, and among the others"),
     "new_particle": ("posterior", "What a particle never measured would do"),
     "discovery_where": ("discovery", "Where law and tests disagree"),
-    "discovery_before_after": ("discovery", "What the law leaves, before and after"),
+    "discovery_before_after": ("before_after", "What the law leaves, before and after"),
     "discovery_ranking": ("discovery", "Every mechanism against the law alone"),
     "discovery_gap": ("discovery", "The gap on held-out particles"),
     "discovery_similarity": ("discovery", "How alike the mechanisms look in these tests"),
@@ -88,7 +76,6 @@ def report_page(results: Results, *, progress: Progress | None = None) -> str:
         )
     with extra("report"):
         import bokeh  # noqa: F401
-        import jinja2  # noqa: F401
     progress = progress or (lambda _: None)
     progress("predicting every particle")
     results = results.with_discovery
@@ -98,9 +85,7 @@ def report_page(results: Results, *, progress: Progress | None = None) -> str:
 
 
 @cache
-def _environment() -> Any:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
+def _environment() -> Environment:
     # Every text of the data passes through here: autoescape has no exceptions in the templates but our own scripts.
     found = Environment(
         loader=PackageLoader("mcc_jax.report"),
@@ -113,8 +98,9 @@ def _environment() -> Any:
     # Bokeh wants a model before what refers to it.
     found.policies["json.dumps_kwargs"] = {"sort_keys": False, "allow_nan": False, "separators": (",", ":")}
     paper = {"a": PAPER_SHAPE_PARAMETER, "modulus_MPa": PAPER_EFFECTIVE_MODULUS_MPA, "log_C": PAPER_LOG_C}
-    found.globals |= {"plain_name": quantity, "exp": math.exp, "paper": paper, "methods": METHODS}
-    filters = (number, percent, probability, with_sd, interval, plain, listed, exponential, spread, equation)
+    found.globals |= {"plain_name": texts.quantity, "exp": math.exp, "paper": paper, "methods": texts.METHODS}
+    numbers, words = (number, percent, probability, with_sd, interval, exponential), (plain, listed)
+    filters = (*numbers, *words, texts.spread, texts.equation)
     found.filters |= {one.__name__: one for one in filters} | {"verdict": verdict_in_words}
     return found
 
@@ -126,110 +112,71 @@ def _unbroken(value: Any) -> Any:
 
 def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     """What the templates show of results and of the curves `shown`."""
-    from markupsafe import Markup, escape
-
     labels = particle_labels([one.name for one in shown], 40)
-    folder = shlex.quote(results.name)
-    checks, law = check_results(results, shown), law_of(results)
-    example = example_of(results, shown)
-    sentences = [] if results.calibration is None else calibration_sentences(results.calibration, law)
+    checks, example, campaign = check_results(results, shown), example_of(results, shown), results.campaign
+    simulated = campaign is not None and campaign.metadata.simulated
+    sentences = [] if results.calibration is None else [*texts.calibration_sentences(results.calibration, results.law)]
     if results.discovery is not None:
-        sentences.insert(0, headline(results.discovery, "simulated tests" if simulated(results) else "tests"))
-    count = 0 if results.campaign is None else len(results.campaign)
+        sentences.insert(0, headline(results.discovery, "simulated tests" if simulated else "tests"))
+    count = 0 if campaign is None else len(campaign)
     measured_only = f"{count} particles were measured; nothing has been calibrated on them yet."
     return {
         "results": results,
         "version": __version__,
-        "simulated": simulated(results),
-        "sections": _sections(results, shown, checks),
+        "simulated": simulated,
         "verdict": sentences[0] if sentences else measured_only,
         "pictures": [] if example is None else example_pictures(example),
         "caption": "" if example is None else example.caption,
-        "tiles": [] if results.discovery is None else tiles(results.discovery),
-        "cards": _cards(results, checks, law),
+        "cards": _cards(results, checks),
         "summary": sentences[1:],
         # A command is copied: its blanks stay as they are.
-        "next_steps": [(text, escape(command)) for text, command in next_steps(results, folder)],
-        "facts": [] if results.campaign is None else measured(results.campaign),
-        "rows": particle_rows(results),
+        "next_steps": [(text, escape(command)) for text, command in texts.next_steps(results)],
+        "facts": [] if campaign is None else texts.measured(campaign),
+        "rows": texts.particle_rows(results),
         "shown": shown,
         "bands": share_inside(shown) is not None,
         "labels": labels,
-        "looks": {word: (marker, colour) for marker, colour, word in (LOOKS[kind] for kind in KINDS)},
-        "seen": sorted({LOOKS[KINDS[k]][2] for one in shown for k in set(one.kind.tolist())}),
-        "chart": {"bokeh": chart_items(), "data": chart_data(shown, labels, particle_facts(results, shown))}
-        if shown
-        else None,
+        "legend": sorted({LOOKS[KINDS[k]] for one in shown for k in one.kind.tolist()}, key=lambda look: look[2]),
+        "chart": chart(shown, labels, texts.particle_facts(results, shown)) if shown else None,
         "bokeh": Markup(chart_scripts()) if shown else "",
-        "draws": results.posterior is not None,
         "checks": checks,
-        "changes": [] if results.discovery is None else changes(results.discovery),
-        "before_after": CAPTIONS["discovery_before_after"][1],
+        "changes": [] if results.discovery is None else texts.changes(results.discovery),
         "figures_of": _figures(results),
-        "folder": folder,
-        "law": law,
-        "law_alone": is_law_alone(results),
+        "law": results.law,
+        "law_alone": results.law_alone,
         "versions": next((one.versions for one in results.provenance.values() if one.versions), {}),
     }
 
 
-def _cards(results: Results, checks: list[Check], law: str) -> list[dict[str, str]]:
-    """The answers at the top, each with a level, a heading and a line."""
-    content = results.calibration
+def _cards(results: Results, checks: list[Check]) -> list[tuple[str, str, str, str]]:
+    """The answers at the top, of the discovery, the calibration and the checks: level, heading, answer and meaning."""
+    content, found = results.calibration, [] if results.discovery is None else list(cards(results.discovery))
     if content is None:
-        return []
-    used, of = sum(entry["kept"] for entry in content["particles"]), "" if law == "the law" else f" of {law}"
+        return found
+    used = sum(entry["kept"] for entry in content["particles"])
+    of = "" if results.law == "the law" else f" of {results.law}"
     done, trusted = content["converged"], worst(tested(results)) != "error"
     good, look, bad = ([f"“{c.check}”" for c in checks if c.level == one] for one in ("good", "look", "bad"))
     failed, conspicuous = len(checks) - len(good), listed([*bad, *look]) if bad or look else "nothing is conspicuous"
     count = f"{failed} of {len(checks)} fail" if failed else f"all {len(checks)} hold"
-    expected = ": to be expected, since it lacks what was found" if (bad or look) and is_law_alone(results) else ""
+    expected = ": to be expected, since it lacks what was found" if (bad or look) and results.law_alone else ""
+    state = "Not converged" if not done else "Converged" if trusted else "Not to be trusted"
+    particles = f"{used} of {len(content['particles'])} particles, by {texts.METHODS[content['method']]}"
+    level, hold = "bad" if bad else "look" if look else "good", count if trusted else "Numbers cannot be true"
     return [
-        {
-            "level": "good" if done and trusted else "bad",
-            "title": f"Calibration{of}",
-            "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
-            "line": f"{used} of {len(content['particles'])} particles, by {METHODS[content['method']]}",
-        },
-        {
-            "level": "bad" if bad else "look" if look else "good",
-            "title": f"Checks{of}",
-            "answer": count if trusted else "Numbers cannot be true",
-            "line": conspicuous + expected,
-        },
+        *found,
+        ("good" if done and trusted else "bad", f"Calibration{of}", state, particles),
+        (level, f"Checks{of}", hold, conspicuous + expected),
     ]
-
-
-def _sections(results: Results, shown: list[FittedCurve], checks: list[Check]) -> list[tuple[str, str]]:
-    """Name and title of every section that has something to show: particles, parameters, checks, details."""
-    calibrated = results.calibration is not None
-    there = (
-        ("compare", "Particles", bool(shown)),
-        ("law", "Law and parameters", True),
-        ("posterior", "Posterior", calibrated),
-        ("diagnostics", "Checks", bool(checks)),
-        ("discovery", "Discovery in detail", results.discovery is not None),
-        ("measured", "The tests", results.campaign is not None or calibrated),
-        ("settings", "Settings and data", True),
-        ("cite", "How to cite", True),
-    )
-    return [(name, title) for name, title, here in there if here]
 
 
 def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:
     """Pictures and captions by section; on a page of the law with what was found, those without it separately."""
-    found: dict[str, list[tuple[str, str]]] = {
-        name: [] for name in ("measured", "law", "compare", "posterior", "discovery", "alone")
-    }
-    order = list(CAPTIONS)
-    for stem in sorted(results.figures, key=lambda s: (order.index(_kind(s)) if _kind(s) in order else 99, s)):
-        section, caption = CAPTIONS.get(_kind(stem), ("posterior", stem.replace("_", " ")))
-        if section in ("law", "compare", "posterior") and results.has_found != stem.startswith("discovery"):
+    sections = ("measured", "law", "compare", "posterior", "discovery", "before_after", "alone")
+    found: dict[str, list[tuple[str, str]]] = {name: [] for name in sections}
+    for kind, (section, caption) in CAPTIONS.items():
+        if section in ("law", "compare", "posterior") and results.has_found != kind.startswith("discovery"):
             section = "alone" if results.has_found else "discovery"
-        found[section].append((data_uri(results.figures[stem]), caption))
+        stems = sorted(stem for stem in results.figures if re.fullmatch(rf"{kind}(_\d+)?", stem))  # of several pages
+        found[section] += [(data_uri(results.figures[stem]), caption) for stem in stems]
     return found
-
-
-def _kind(stem: str) -> str:
-    """The stem without the number of a page: `particles_2` is one of `particles`."""
-    return re.sub(r"_\d+$", "", stem)

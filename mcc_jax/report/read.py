@@ -14,7 +14,7 @@ import msgspec
 
 from .. import arguments
 from .._errors import InputError
-from .._format import described
+from .._format import described, listed, plain
 from ..calibrate import Posterior
 from ..calibrate.results import ARCHIVE, CONTENT, DISCOVERY_ARCHIVE, Calibration, read_saved
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
@@ -28,6 +28,7 @@ FIGURE = re.compile(r"figures/([A-Za-z0-9_-]+)\.png")
 PNG = b"\x89PNG\r\n\x1a\n"
 LARGEST_FIGURE = 2**21
 """Bytes; a page must stay small enough to send."""
+A_FOLDER, AGAIN = "Give a folder that mcc-jax demo, calibrate or discover wrote into", "Calibrate or discover again"
 
 
 class Tests(msgspec.Struct):
@@ -90,22 +91,15 @@ class Results:
         return self.saved if isinstance(self.saved, Posterior) else None
 
     @property
-    def with_found(self) -> Posterior | None:
-        """The posterior of the law with what discovery added, if it may be believed and is of all these particles.
-
-        None, too, where the calibration is of a law with effects itself, or there is none to compare it with.
-        """
-        posterior = None if self.found is None else self.found.posterior
-        if posterior is None or self.campaign is None or self.calibration is None or self.calibration.get("effects"):
-            return None
-        same = posterior.campaign.particles == self.campaign.particles
-        return posterior if same and not posterior.failures() else None
-
-    @property
     def with_discovery(self) -> Results:
-        """What a page shows: of the law with what discovery added where that may be believed, else as it is."""
-        posterior = self.with_found
-        if posterior is None:
+        """What a page shows: of the law with what discovery added where that may be believed, else as it is.
+
+        It may where its draws converged, are of all these particles, and the calibration is of a law without effects.
+        """
+        posterior, alone = None if self.found is None else self.found.posterior, self.calibration
+        if posterior is None or posterior.failures() or alone is None or alone.get("effects"):
+            return self
+        if self.campaign is None or posterior.campaign.particles != self.campaign.particles:
             return self
         provenance = {**self.provenance, CALIBRATION: self.provenance[DISCOVERY]}
         return replace(self, calibration=posterior.to_json(), provenance=provenance, saved=posterior)
@@ -114,6 +108,18 @@ class Results:
     def has_found(self) -> bool:
         """Whether the calibration is the discovery's own, of the law with what it added."""
         return self.found is not None and self.saved is not None and self.saved is self.found.posterior
+
+    @property
+    def law_alone(self) -> bool:
+        """Whether the calibration is of the law without the effects that were found to be missing in it."""
+        found, calibration = self.discovery, self.calibration
+        return bool(found and found["effects"] and calibration and not calibration.get("effects"))
+
+    @property
+    def law(self) -> str:
+        """What the law of the calibration is called: "the law", alone or with its effects where that matters."""
+        names = [plain(effect["mechanism"]) for effect in (self.calibration or {}).get("effects", ())]
+        return f"the law with {listed(names)}" if names else f"the law{' alone' * self.law_alone}"
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -145,35 +151,30 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
     Raises:
         InputError: if a file is damaged or there is nothing to report.
     """
-    path, again = arguments.file_path(folder, "folder"), "Calibrate or discover again"
+    path = arguments.file_path(folder, "folder")
     try:
         there = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
     except OSError as error:
-        remedy = "Give a folder that mcc-jax demo, calibrate or discover wrote into"
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path, remedy=remedy) from None
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path, remedy=A_FOLDER) from None
+    saved, contents, written, cautions = {}, {}, {}, []
     for file, archive in ARCHIVES.items():
-        if file in there and archive not in there:
-            raise InputError(f"{archive} is missing next to {file}", file=path, remedy=again)
-    saved = {file: read_saved(path / archive) for file, archive in ARCHIVES.items() if archive in there}
-    contents = {file: result.to_json() for file, result in saved.items()}
-    cautions, written = [], {file: Written() for file in saved}
-    for file in sorted(there & set(saved)):
-        try:
-            found = msgspec.json.decode(read_regular(path / file, RESULT_BYTES, again), type=Written)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise InputError(f"is damaged: {error}", file=path / file, remedy=again) from None
-        if found.runtime_s == contents[file]["runtime_s"]:
-            written[file] = found
-        else:
-            cautions.append(f"{file} is not of the {ARCHIVES[file]} next to it, and is left out")
+        if archive not in there:
+            if file in there:
+                raise InputError(f"{archive} is missing next to {file}", file=path, remedy=AGAIN)
+            continue
+        saved[file] = read_saved(path / archive)
+        contents[file] = saved[file].to_json()
+        written[file] = _written(path / file) if file in there else Written()
+        if file in there and written[file].runtime_s != contents[file]["runtime_s"]:
+            written[file] = Written()
+            cautions.append(f"{file} is not of the {archive} next to it, and is left out")
     provenance = {file: one.provenance for file, one in written.items()}
     where, why = (Path(campaign), "") if campaign is not None else _find(path, there, provenance)
     data = None if where is None else check_tests(read_campaign(where))
     checksums = {} if where is None else file_checksums(where)
     if data is None and not saved:
-        remedy = "Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: "
-        remedy += ", ".join(sorted(there)[:8]) or "nothing"
-        raise InputError("there is nothing to report", file=path, remedy=remedy)
+        problem = f"there is nothing to report: the folder holds {listed(sorted(there)[:8])}"
+        raise InputError(problem, file=path, remedy=A_FOLDER)
     calibration = saved.get(CALIBRATION)
     days = (datetime.date.fromtimestamp((path / ARCHIVES[file]).stat().st_mtime) for file in saved)
     return Results(
@@ -186,10 +187,17 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
         calibration,
         _figures(path, [name for one in written.values() for name in one.figures]),
         max(days, default=None),
-        (*cautions, *_cautions(data, checksums, provenance, contents.get(CALIBRATION))),
+        (*cautions, *_cautions(checksums, provenance)),
         why,
         saved.get(DISCOVERY),
     )
+
+
+def _written(file: Path) -> Written:
+    try:
+        return msgspec.json.decode(read_regular(file, RESULT_BYTES, AGAIN), type=Written)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"is damaged: {error}", file=file, remedy=AGAIN) from None
 
 
 def _find(path: Path, there: set[str], provenance: Mapping[str, Provenance]) -> tuple[Path | None, str]:
@@ -208,12 +216,7 @@ def _find(path: Path, there: set[str], provenance: Mapping[str, Provenance]) -> 
     return None, "The results do not say where their campaign is."
 
 
-def _cautions(
-    data: Campaign | None,
-    checksums: Mapping[str, str],
-    provenance: Mapping[str, Provenance],
-    calibration: dict[str, Any] | None,
-) -> Iterator[str]:
+def _cautions(checksums: Mapping[str, str], provenance: Mapping[str, Provenance]) -> Iterator[str]:
     recorded = {name: one.campaign.sha256 for name, one in provenance.items() if one.campaign is not None}
     for name, sums in recorded.items():
         changed = [f for f in DATA if f in sums and f in checksums and sums[f] != checksums[f]]
@@ -223,19 +226,14 @@ def _cautions(
         one, other = recorded.values()
         if any(one.get(f) != other.get(f) for f in DATA):
             yield f"{CALIBRATION} and {DISCOVERY} were made from different data"
-    if data is not None and calibration is not None:
-        missing = [name for entry in calibration["particles"] if (name := entry["particle"]) not in data.particles]
-        if missing:
-            yield f"{len(missing)} particles of {CALIBRATION} are not in the campaign, {missing[0]!r} first"
 
 
 def _figures(path: Path, names: list[str]) -> dict[str, bytes]:
     """Pictures by stem; the page does without those that cannot be read."""
     found = {}
-    for name in names:
-        match = FIGURE.fullmatch(name)
-        with contextlib.suppress(OSError, InputError):
-            picture = read_regular(path / name, LARGEST_FIGURE, "") if match else b""
-            if match and picture.startswith(PNG):
+    for match in filter(None, map(FIGURE.fullmatch, names)):
+        with contextlib.suppress(InputError):
+            picture = read_regular(path / match[0], LARGEST_FIGURE, "")
+            if picture.startswith(PNG):
                 found[match[1]] = picture
     return found

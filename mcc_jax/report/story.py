@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from matplotlib.transforms import ScaledTranslation
 from .._format import listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import FittedCurve
 from ..discovery import Discovery
-from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, VERMILION, Look, is_simulated, new_figure
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, VERMILION, Look, new_figure
 from .read import Results
 from .texts import quantity
 
@@ -119,7 +119,7 @@ def most_informative_test(found: Discovery) -> Example | None:
         two if added else None,
         noise,
         f"law with {name}" if added else "",
-        is_simulated(campaign.metadata),
+        campaign.metadata.simulated,
     )
 
 
@@ -223,9 +223,11 @@ def data_uri(picture: bytes, kind: str = "png") -> str:
 # ---- the words -------------------------------------------------------------------------------------------------------
 
 
-def tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Heading, answer and meaning: how much of the gap is closed, what that did to the modulus, and the amplitude."""
-    made = []
+def cards(found: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
+    """Of a discovery how much of the gap is closed, what that did to the modulus, and the amplitude.
+
+    Each is no level, a heading, the answer, and what it means.
+    """
     gap = found["gap"]
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))
@@ -233,35 +235,33 @@ def tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
             "of what the law alone missed on particles that were held out, each predicted from others: χ² "
             f"per point (misfit in units of the noise) falls from {before} to {after}; 1 is noise alone."
         )
-        made.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
+        yield "", "Gap closed", percent(gap["closed_fraction"], 3), meaning
     sides = found["parameters_before"], found["parameters_after"]
     before, after = (side.get("modulus_at_peaks_MPa", side.get("effective_modulus_MPa")) or {} for side in sides)
     if before.get("value") is not None and after.get("value") is not None:
         change = 100 * (after["value"] / before["value"] - 1)
         way = f"{number(abs(change), 2)} % {'higher' if change > 0 else 'lower'}"
         meaning = f"at the peaks of these tests; {way} than by the law alone, which gives {with_sd(before, 1e-3)} GPa."
-        made.append(("Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning))
+        yield "", "Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning
     for effect in found["effects"]:
-        parameters = [(quantity(name), with_sd(value)) for name, value in effect["parameters"].items()]
-        if parameters:
-            (name, value), *others = parameters
-            more = "".join(f"; {other} {text}" for other, text in others)
-            meaning = (
-                f"{name}, ± one standard deviation{more}. That it is this one, of {len(found['ranking'])} effects that "
-                f"these tests could show, has probability {probability(effect['probability'])}."
-            )
-            made.append((plain(effect["mechanism"]).capitalize(), value, meaning))
+        (name, value), *others = [(quantity(name), with_sd(value)) for name, value in effect["parameters"].items()]
+        more = "".join(f"; {other} {text}" for other, text in others)
+        meaning = (
+            f"{name}, ± one standard deviation{more}. That it is this one, of {len(found['ranking'])} effects that "
+            f"these tests could show, has probability {probability(effect['probability'])}."
+        )
+        yield "", plain(effect["mechanism"]).capitalize(), value, meaning
     if found["verdict"] == "NO_GAP":
-        chance = found.get("p_anything_missing")
+        chance = found["p_anything_missing"]
         if chance is not None:
             meaning = "that tests of a law that lacks nothing disagree with it at least so much."
-            made.append(("Disagreement by chance", f"probability {probability(chance)}", meaning))
+            yield "", "Disagreement by chance", f"probability {probability(chance)}", meaning
         seen = [
-            f"{plain(e['mechanism'])} from {number(e['detection_limit'], 2)} {e['unit'].replace('um', 'µm').strip('-')}"
-            for e in found["ranking"]
-            if e["detection_limit"] is not None
+            f"{plain(one['mechanism'])} from {number(one['detection_limit'], 2)} "
+            + one["unit"].replace("um", "µm").strip("-")
+            for one in found["ranking"]
+            if one["detection_limit"] is not None
         ]
         if seen:
             examples = "; ".join(text.rstrip() for text in seen[:3])
-            made.append(("What would have shown", f"{len(found['ranking'])} effects", f"For example {examples}."))
-    return made
+            yield "", "What would have shown", f"{len(found['ranking'])} effects", f"For example {examples}."

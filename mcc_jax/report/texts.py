@@ -6,17 +6,17 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from .._format import interval, listed, number, percent, plain, span, with_sd
 from ..calibrate.curves import FittedCurve
 from ..calibrate.estimates import quantities
 from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from ..discovery.sentences import next_tests
-from ..plots.style import is_simulated
 from .read import Results
 
 METHODS = {
@@ -40,9 +40,8 @@ def quantity(name: str) -> str:
     return f"{label} [{'1' * unit.startswith('/')}{unit}]" if unit else label
 
 
-def equation(text: str) -> Any:
+def equation(text: str) -> Markup:
     """An equation as the library writes it, for a page: Greek letters, indices and powers."""
-    from markupsafe import Markup, escape
 
     def name(match: re.Match[str]) -> str:
         letter, number, below = match["letter"], match["number"] or "", (match["below"] or "_")[1:]
@@ -59,89 +58,77 @@ def equation(text: str) -> Any:
     return Markup(written)
 
 
-# ---- which law -------------------------------------------------------------------------------------------------------
-
-
-def simulated(results: Results) -> bool:
-    """Whether these data were computed, not measured."""
-    return results.campaign is not None and is_simulated(results.campaign.metadata)
-
-
-def is_law_alone(results: Results) -> bool:
-    """Whether the calibration is of the law without the effects that were found to be missing in it."""
-    found, calibration = results.discovery, results.calibration
-    return bool(found and found["effects"] and calibration and not calibration.get("effects"))
-
-
-def law_of(results: Results) -> str:
-    """What the law of the calibration is called: "the law", alone or with its effects where that matters."""
-    if is_law_alone(results):
-        return "the law alone"
-    effects = (results.calibration or {}).get("effects")
-    return f"the law with {listed([plain(effect['mechanism']) for effect in effects])}" if effects else "the law"
-
-
 # ---- sentences -------------------------------------------------------------------------------------------------------
 
 
-def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list[str]:
+def calibration_sentences(content: dict[str, Any], law: str = "the law") -> Iterator[str]:
     """A `calibration.json` in a few sentences; of the law "alone", which lacks something, no numbers are shown."""
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
-    found = [
-        f"{law[:1].upper()}{law[1:]} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
-        + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
-    ]
+    end = "." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on."
+    yield f"{law.capitalize()} was calibrated on {used} of {count} particles by {METHODS[content['method']]}{end}"
     if law.endswith("alone"):
-        return found
-    sure = SURE.get(content["method"])
-    if sure is None:
-        found.append("This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both.")
-    else:
-        known = [
-            f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
-            for name, key, factor, unit in (
-                ("the shape parameter a, how much more a flat particle is strained than a sphere,", "a", 1.0, ""),
-                ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
-            )
-            if content[key]["interval_95"] is not None
-        ]
-        if known:
-            found.append(f"Given {law} and these tests, {listed(known)}, each {sure}.")
+        return
+    shape = "the shape parameter a, how much more a flat particle is strained than a sphere,"
+    known = [
+        f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
+        for name, key, factor, unit in (
+            (shape, "a", 1.0, ""),
+            ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
+        )
+        if content[key]["interval_95"] is not None
+    ]
+    if content["method"] == "paper":
+        yield "This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both."
+    elif known:
+        yield f"Given {law} and these tests, {listed(known)}, each {SURE[content['method']]}."
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
-        found.append(
+        yield (
             f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
             f"{percent(misfit)} of its range (median over the particles)."
         )
-    return found
 
 
-def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
+def next_steps(results: Results) -> Iterator[tuple[str, str]]:
     """What to do next: a sentence and a command (or nothing) each, the most urgent first."""
-    steps: list[tuple[str, str]] = []
-    content, found, calibrate = results.calibration, results.discovery, f"mcc-jax calibrate CAMPAIGN --out {folder}"
+    folder, content, found = shlex.quote(results.name), results.calibration, results.discovery
+    calibrate = f"mcc-jax calibrate CAMPAIGN --out {folder}"
     if results.campaign is None:
-        steps.append(("Show measured against predicted:", f"mcc-jax report {folder} --campaign CAMPAIGN"))
+        yield "Show measured against predicted:", f"mcc-jax report {folder} --campaign CAMPAIGN"
     if content is None:
-        steps.append(("Calibrate the law on these tests:", calibrate))
+        yield "Calibrate the law on these tests:", calibrate
     elif not content["converged"]:
         lacking = (
             "The law alone does not fit these tests, which may be why its calibration did not converge; what failed "
             "is listed under Checks."
         )
         first = "Resolve what failed under Checks before anything else."
-        steps.append((lacking if found is not None and found["effects"] else first, ""))
+        yield lacking if found is not None and found["effects"] else first, ""
     elif content["method"] != "bayes":
         paper = content["method"] == "paper"
-        what = "the uncertainty of every number" if paper else "the posterior, not only a best fit"
-        steps.append((f"Get {what}:", calibrate))
+        yield f"Get {'the uncertainty of every number' if paper else 'the posterior, not only a best fit'}:", calibrate
     if found is None:
-        steps.append(("Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"))
+        yield "Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"
     else:
-        steps += _after(found, added=results.has_found)
+        yield from _after(found, added=results.has_found)
     if content is not None and content["converged"] and (found is None or found["verdict"] == "NO_GAP"):
-        steps.append(("Predict tests that you plan:", "mcc-jax simulate --out planned"))
-    return steps
+        yield "Predict tests that you plan:", "mcc-jax simulate --out planned"
+
+
+def _after(found: dict[str, Any], *, added: bool) -> Iterator[tuple[str, str]]:
+    """What to do after a discovery; `added` if the page is of the law with what was added already."""
+    separating = next_tests(found["next_experiments"], found["checks"])
+    if separating:
+        yield " ".join(separating), ""
+    elif found["verdict"] == "NO_GAP" and found["untestable"]:
+        needs = sorted({entry["needs"] for entry in found["untestable"]})
+        yield f"To learn about more mechanisms, the tests need {listed(needs)}.", ""
+    elif found["verdict"] in ("NAMED", "SET", "UNLISTED") and added:
+        yield "Use the law together with the added effects; the parameters below include them.", ""
+    elif found["verdict"] in ("NAMED", "SET", "UNLISTED"):
+        use = "Use the law together with what was added (parameters “after” below), not alone"
+        command = calibration_with_found(found, "CAMPAIGN")
+        yield f"{use}. All about it, from every particle's curve to the checks:" if command else f"{use}.", command
 
 
 def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
@@ -154,23 +141,6 @@ def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
         return ""
     options = " ".join(f"--effect {shlex.quote(name)}" for name in named)
     return f"mcc-jax calibrate {campaign} {options} --out with-effect"
-
-
-def _after(found: dict[str, Any], *, added: bool) -> list[tuple[str, str]]:
-    """What to do after a discovery; `added` if the page is of the law with what was added already."""
-    verdict, separating = found["verdict"], next_tests(found["next_experiments"], found["checks"])
-    if separating:
-        return [(" ".join(separating), "")]
-    if verdict in ("NAMED", "SET", "UNLISTED"):
-        if added:
-            return [("Use the law together with the added effects; the parameters below include them.", "")]
-        use = "Use the law together with what was added (parameters “after” below), not alone"
-        command = calibration_with_found(found, "CAMPAIGN")
-        return [(f"{use}. All about it, from every particle's curve to the checks:" if command else f"{use}.", command)]
-    if verdict == "NO_GAP" and found["untestable"]:
-        needs = sorted({entry["needs"] for entry in found["untestable"]})
-        return [(f"To learn about more mechanisms, the tests need {listed(needs)}.", "")]
-    return []
 
 
 def spread(log: dict[str, Any]) -> str:
@@ -250,21 +220,11 @@ def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
     return facts
 
 
-def particle_rows(results: Results) -> list[dict[str, Any]]:
-    """The table of particles: sizes, what was measured, what was found, and whether it was used."""
+def particle_rows(results: Results) -> list[tuple[str, Any, Any, Any]]:
+    """Name, diameters [um], curve and entry in `calibration.json` of every particle; None for what is not there."""
     campaign, content = results.campaign, results.calibration
-    entries = {e["particle"]: e for e in content["particles"]} if content else {}
-    rows = []
-    for i, name in enumerate(entries if campaign is None else campaign.particles):
-        entry, row = entries.get(name), {"name": name, "kept": None, "why_not": None}
-        if campaign is not None:
-            row["sizes"] = [number(d) for d in campaign.diameters_um[i]]
-            row["peak"] = number(float(np.max(campaign.curves[i].force_mN)))
-            row["points"] = len(campaign.curves[i])
-        if entry is not None:
-            kept = entry["kept"]
-            row |= {"kept": kept, "why_not": entry["why_not"], "eta": number(entry["eta_p"]["value"], 3)}
-            row["C"] = [with_sd(entry[c]) if kept else "–" for c in ("C1", "C3", "C5")]
-            row["rms"] = number(entry.get("own_rms_um", entry["rms_um"]), 2) if kept else "–"
-        rows.append(row)
-    return rows
+    entries = {entry["particle"]: entry for entry in content["particles"]} if content else {}
+    if campaign is None:
+        return [(name, None, None, entry) for name, entry in entries.items()]
+    tests = zip(campaign.particles, campaign.diameters_um, campaign.curves, strict=True)
+    return [(*test, entries.get(test[0])) for test in tests]

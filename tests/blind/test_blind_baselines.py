@@ -1,7 +1,5 @@
 """The baselines: an oracle on made campaigns, AIC and the discrepancy on a small linear problem."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -85,12 +83,6 @@ def test_marginal_likelihood_against_the_dense_one():
     expected = -0.5 * (np.linalg.slogdet(dense)[1] + y @ np.linalg.solve(dense, y)) + 15.0
     assert value == pytest.approx(expected, rel=1e-10)
     assert weights == pytest.approx(prior**2 * (X.T @ np.linalg.solve(dense, y)), rel=1e-8)
-
-
-def test_the_library_of_another_checkout_comes_first(monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    assert adapter.find(f"checkout:{tmp_path}") is adapter.in_process
-    assert sys.path[0] == str(tmp_path)
 
 
 @pytest.mark.parametrize("solver", [baselines.aic, baselines.discrepancy])

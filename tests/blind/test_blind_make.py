@@ -170,13 +170,3 @@ def test_segments_of_a_path():
     force = np.array([1.0, 2.0, 3.0, 2.0, 1.0, 2.0, 3.0, 4.0, 4.0, 2.0])
     kinds = [world.LOADING] * 3 + [world.UNLOADING] * 2 + [world.RELOADING] * 2 + [world.LOADING, world.HOLD]
     assert world.segments(force).tolist() == [*kinds, world.UNLOADING]
-
-
-@pytest.mark.parametrize("generator", GENERATORS)
-@pytest.mark.parametrize("mechanism", MECHANISMS)
-def test_every_mechanism_reaches_a_moderate_strength(generator, mechanism):
-    known = world.generators()[generator]
-    formula = known.formulas(mechanism)[0]
-    protocol = known.protocols(mechanism, formula)[-1]
-    made = make.make(single(generator, mechanism, formula, 8.0, protocol=protocol, particles=40), 5)
-    assert made.answer["effects"][0]["lambda"] > 4.0

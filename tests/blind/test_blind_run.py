@@ -93,9 +93,3 @@ def test_an_unknown_solver_shows_in_every_outcome():
     assert "nobody" in row["error"]
     with pytest.raises(ValueError, match="no solver"):
         adapter.find("nobody")
-
-
-@pytest.mark.parametrize("text", ["0/3", "4/3", "x", "1"])
-def test_a_part_that_is_none(text):
-    with pytest.raises(Exception, match="is no part"):
-        run.part_of(text)

@@ -9,16 +9,6 @@ from mcc_jax import InputError
 from mcc_jax._store import LOCK, READY, WORK, json_text, results, write_file
 
 
-def test_results_appear_together(tmp_path):
-    out = tmp_path / "a" / "b"
-    with results(out) as stage:
-        (stage.folder / "sub").mkdir()
-        (stage.folder / "one.txt").write_text("1")
-        (stage.folder / "sub" / "two.txt").write_text("2")
-        assert not (out / "one.txt").exists()
-    assert snapshot(out) == {"one.txt": b"1", "sub": None, "sub/two.txt": b"2"}
-
-
 def test_only_files_named_stale_go(tmp_path):
     for name in ("old.png", "kept.png", "one.txt"):
         (tmp_path / name).write_text("old")

@@ -47,13 +47,6 @@ def test_help_loads_nothing_heavy():
     assert result.stderr == ""
 
 
-def test_bad_input_is_one_line(tmp_path):
-    result = call("calibrate", tmp_path / "nothing", "--out", tmp_path / "fit")
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr.startswith("mcc-jax: error: ")
-    assert result.stderr.count("\n") == 1
-
-
 def test_a_missing_accelerator_is_one_line(tmp_path):
     """JAX itself says it in a traceback of a hundred lines, or not before it computes."""
     wanted = os.environ | {"JAX_PLATFORMS": "tpu"}  # a machine may have a graphics card, but hardly one of these
@@ -164,26 +157,6 @@ def test_a_signal_within_a_destructor_is_not_lost(number, status, line):
     )
     result = subprocess.run([sys.executable, "-c", code, "halt"], capture_output=True, text=True, timeout=30)
     assert (result.returncode, result.stdout, result.stderr) == (status, "", line)
-
-
-@posix
-def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
-    holder = (
-        "import sys, time; from pathlib import Path; from mcc_jax._store import results\n"
-        "with results(Path(sys.argv[1])): print('in', flush=True); time.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", holder, str(tmp_path)], stdout=subprocess.PIPE) as process:
-        assert process.stdout.readline() == b"in\n"
-        result = call("simulate", "--out", tmp_path, "--points", "20")
-        assert result.returncode == 2
-        assert "another mcc-jax run is writing there" in result.stderr
-        process.kill()
-        process.wait()
-    assert any(name.startswith(".mcc-jax") for name in snapshot(tmp_path))
-    result = call("simulate", "--out", tmp_path, "--points", "20")
-    assert (result.returncode, errors(result.stderr)) == (0, "")
-    assert "\x1b" not in result.stdout + result.stderr
-    assert set(snapshot(tmp_path)) == {"particles.csv", "curves.csv", "campaign.toml"}
 
 
 @posix

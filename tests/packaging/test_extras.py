@@ -84,10 +84,10 @@ def _report(_):
 
 def _write(folder):
     from mcc_jax._store import Stage
-    from mcc_jax.cli.calibrate import write_calibration
+    from mcc_jax.cli.session import write_result
 
     posterior = object.__new__(mcc.Posterior)
-    return write_calibration(posterior, Stage(folder, folder), origin={}, figures=False, progress=print)
+    return write_result(posterior, Stage(folder, folder), origin={}, figures=False, progress=print)
 
 
 SPHERE = mcc.Particle(200.0, 200.0, 200.0)

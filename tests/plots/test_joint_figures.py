@@ -12,7 +12,6 @@ from reading_figures import check_layout, check_words, panels, texts
 from scipy.stats import nakagami
 
 from mcc_jax.calibrate import least_squares, sample
-from mcc_jax.campaign import Metadata
 from mcc_jax.plots import (
     least_squares_figures,
     plot_bands,
@@ -24,7 +23,7 @@ from mcc_jax.plots import (
     posterior_figures,
     save_figures,
 )
-from mcc_jax.plots.posterior import CoefficientTable, density, draw_forest, posterior_table, prior_near, shrinkage
+from mcc_jax.plots.posterior import CoefficientTable, density, draw_forest, prior_near, shrinkage
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
@@ -108,13 +107,6 @@ def test_names_are_drawn_as_they_stand(calibrations):
 
 
 @pytest.mark.extended
-def test_a_measured_campaign_is_not_called_simulated(calibrations):
-    for calibration, plot in zip(calibrations["paper"], (plot_bands, plot_fits), strict=True):
-        measured = dataclasses.replace(calibration.campaign, metadata=Metadata(provenance="tester file x.tri"))
-        assert "simulated data" not in texts(plot(dataclasses.replace(calibration, campaign=measured)))
-
-
-@pytest.mark.extended
 def test_what_must_not_be_relied_on_is_said(calibrations):
     posterior, squares = calibrations["one"]
     assert not posterior.converged
@@ -144,15 +136,6 @@ def test_forest_has_a_row_for_every_particle(figures, calibrations, kind):
             else:
                 entries = squares.to_json()["particles"]
                 np.testing.assert_allclose(dots.get_xdata(), [e[("C1", "C3", "C5")[j]]["value"] for e in entries])
-
-
-def test_intervals_hold_their_share_of_the_draws(calibrations):
-    posterior = calibrations["paper"][0]
-    table = posterior_table(posterior)
-    for ends, share in ((table.wide, 0.95), (table.narrow, 0.5)):
-        held = np.mean((ends[0] <= posterior.C) & (ends[1] >= posterior.C), axis=(0, 1))
-        np.testing.assert_allclose(held, share, atol=0.01)
-    assert np.all((table.spread[0] < table.median) & (table.median < table.spread[1]))
 
 
 @pytest.mark.parametrize(("count", "rows"), [(40, 40), (41, 41), (120, 120), (5000, 200)])

@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mcc_jax.campaign import Metadata
-from mcc_jax.plots.style import is_simulated, particle_labels, plain
+from mcc_jax.plots.style import particle_labels, plain
 
 
 def drawn(text):
@@ -50,7 +50,6 @@ def test_labels_are_told_apart():
 
 
 def test_simulated():
-    assert is_simulated(Metadata(provenance="drawn from a table; not a measurement"))
-    assert is_simulated(Metadata(other={"simulation": {"seed": 1}}))
-    assert not is_simulated(Metadata())
-    assert not is_simulated(Metadata(provenance="file x.txt of tester y"))
+    assert Metadata(provenance="drawn from a table; not a measurement").simulated
+    assert Metadata(other={"simulation": {"seed": 1}}).simulated
+    assert not Metadata(provenance="file x.txt of tester y").simulated

@@ -55,16 +55,12 @@ def calibration(names=NAMES, **changes):
         kept = i < len(names) - 1
         eta = 1 + A * (1 - SIZES[i, 2] ** 2 / (SIZES[i, 0] * SIZES[i, 1]))
         values = {"eta_p": eta, "C1": C[i, 0], "C3": C[i, 1], "C5": C[i, 2], "zero_um": ZERO[i]}
+        entry = {key: estimate(value) if kept else nothing() for key, value in values.items()}
+        why_not = None if kept else "has 3 usable points on loading, fewer than 12"
         particles.append(
-            {
-                "particle": name,
-                **{key: estimate(value) if kept else nothing() for key, value in values.items()},
-                "rms_um": NOISE if kept else None,
-                "kept": kept,
-                "why_not": None if kept else "has 3 usable points on loading, fewer than 12",
-            }
+            {"particle": name, **entry, "rms_um": NOISE if kept else None, "kept": kept, "why_not": why_not}
         )
-    spread = {f"log_C{k}": {"mean": estimate(m), "sd": estimate(0.1)} for k, m in ((1, 1.9), (3, 1.09), (5, 0.98))}
+    diagnostics = {"rhat_max": 1.004, "ess_bulk_min": 900.0, "divergences": 0, "pareto_k_max": 0.3, "own_misfit": 0.001}
     return {
         "schema": 1,
         "method": "bayes",
@@ -74,7 +70,7 @@ def calibration(names=NAMES, **changes):
         "law": {"unloading": "printed", "strain_scaling": "raw"},
         "a": estimate(A),
         "effective_modulus_MPa": estimate(MODULUS, 10.0),
-        **spread,
+        **{f"log_C{k}": {"mean": estimate(m), "sd": estimate(0.1)} for k, m in ((1, 1.9), (3, 1.09), (5, 0.98))},
         "yield_stress_MPa": estimate(0.4),
         "probability_not_monotone": estimate(0.02),
         "noise": {"displacement_um": estimate(NOISE, 0.001)},
@@ -83,13 +79,7 @@ def calibration(names=NAMES, **changes):
         "findings": [],
         "particles": particles,
         "warnings": ["particle 'left out' could not be used"],
-        "diagnostics": {
-            "rhat_max": 1.004,
-            "ess_bulk_min": 900.0,
-            "divergences": 0,
-            "pareto_k_max": 0.3,
-            "own_misfit": 0.001,
-        },
+        "diagnostics": diagnostics,
         "figures": ["figures/forest.png"],
         "files": ["posterior.nc"],
     } | changes
@@ -97,63 +87,31 @@ def calibration(names=NAMES, **changes):
 
 def discovery(**changes):
     """`discovery.json` with every part filled."""
-    pair = {"a": estimate(1.2), "effective_modulus_MPa": estimate(9000.0, 50.0)}
+    frame, rivals = {"mechanism": "frame_compliance", "probability": 0.8}, ["frame_compliance", "platen_sink_in"]
+    effect = frame | {"variant": "linear", "p_family_wise": 0.0, "equation": "d = C F"}
+    effect |= {"explanation": "A linear spring in series with the particle."}
+    effect |= {"parameters": {"compliance_um_per_mN": estimate(0.004, 1e-5)}}
+    ranked = frame | {"statistic": 40.0, "estimate": 0.004, "detection_limit": 0.0001, "unit": "um/mN"}
+    place = {"segment": "loading", "load_fraction": [0.1, 0.3], "strain": [0.0, 0.4], "share": 0.6}
+    place |= {"particles": ["1", "C"], "direction": "more displacement than the law"}
+    further = {"experiment": "a hold of 60 s at the largest load", "separates": rivals, "particles": 6, "power": 0.95}
     logs = {f"log_C{k}": {"mean": estimate(m), "sd": nothing()} for k, m in ((1, 1.9), (3, 1.0), (5, 0.9))}
     step = {"chi2_per_dof": 2.0, "systematic_um": 0.07, "elpd": 0.0, "elpd_se": 0.0}
+    steps = [{"added": None, **step}, {"added": "frame_compliance", **step, "systematic_um": 0.001}]
     return {
         "schema": 1,
         "verdict": "SET",
         "summary": "The law and the 3 tests disagree.",
-        "effects": [
-            {
-                "mechanism": "frame_compliance",
-                "variant": "linear",
-                "probability": 0.8,
-                "p_family_wise": 0.0,
-                "equation": "d = C F",
-                "explanation": "A linear spring in series with the particle.",
-                "parameters": {"compliance_um_per_mN": estimate(0.004, 1e-5)},
-            }
-        ],
-        "candidate_set": [["frame_compliance", "platen_sink_in"]],
-        "ranking": [
-            {
-                "mechanism": "frame_compliance",
-                "statistic": 40.0,
-                "estimate": 0.004,
-                "detection_limit": 0.0001,
-                "unit": "um/mN",
-                "probability": 0.8,
-            }
-        ],
+        "effects": [effect],
+        "candidate_set": [rivals],
+        "ranking": [ranked],
         "untestable": [{"mechanism": "humidity", "needs": "a column relative_humidity_percent"}],
-        "where": [
-            {
-                "segment": "loading",
-                "load_fraction": [0.1, 0.3],
-                "strain": [0.0, 0.4],
-                "share": 0.6,
-                "particles": ["1", "C"],
-                "direction": "more displacement than the law",
-            }
-        ],
+        "where": [place],
         "closure": None,
-        "gap": {
-            "floor": 1.0,
-            "heldout": "leave-one-particle-out",
-            "steps": [{"added": None, **step}, {"added": "frame_compliance", **step, "systematic_um": 0.001}],
-            "closed_fraction": 0.99,
-        },
-        "parameters_before": pair | logs,
+        "gap": {"floor": 1.0, "heldout": "leave-one-particle-out", "steps": steps, "closed_fraction": 0.99},
+        "parameters_before": {"a": estimate(1.2), "effective_modulus_MPa": estimate(9000.0, 50.0)} | logs,
         "parameters_after": {"a": estimate(A), "effective_modulus_MPa": estimate(MODULUS)} | logs,
-        "next_experiments": [
-            {
-                "experiment": "a hold of 60 s at the largest load",
-                "separates": ["frame_compliance", "platen_sink_in"],
-                "particles": 6,
-                "power": 0.95,
-            }
-        ],
+        "next_experiments": [further],
         "runtime_s": 2.0,
         "seed": 0,
         "notes": ["few particles"],

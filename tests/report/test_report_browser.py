@@ -1,7 +1,6 @@
 """The page in a real browser: it loads without a complaint, draws its plots, and switches particles."""
 
 import os
-import re
 import shutil
 
 import pytest
@@ -81,47 +80,6 @@ def tab(request, browser, file):
     yield tab
     context.close()
     assert complaints == []
-
-
-def requested(browser, file):
-    """Every address that the page asks for while it is read from end to end, but for what it holds itself.
-
-    The page's own policy, which would keep a loader from asking, is switched off; nothing leaves this machine.
-    """
-    asked = []
-    context = browser.new_context(bypass_csp=True)
-    context.on("request", lambda request: asked.append(request.url))
-    context.route(re.compile("^(?!file:|data:|blob:)"), lambda route: route.abort())
-    tab = context.new_page()
-    tab.on("websocket", lambda socket: asked.append(socket.url))
-    tab.goto(file.as_uri())
-    tab.wait_for_selector("#interactive[data-ready]", timeout=60_000)
-    tab.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true; })")
-    for i in range(tab.evaluate("document.querySelector('#particle').options.length")):
-        tab.select_option("#particle", index=i)
-    tab.locator("#chart-curve").hover()
-    tab.evaluate("window.scrollTo(0, document.body.scrollHeight)")
-    tab.emulate_media(media="print")
-    tab.wait_for_timeout(300)
-    context.close()
-    return {url for url in asked if not url.startswith(("data:", "blob:"))}
-
-
-LOADERS = {
-    "image": '<img src="https://shown.invalid/a.png" alt="">',
-    "script": '<script src="https://shown.invalid/a.js"></script>',
-    "style": '<link rel="stylesheet" href="https://shown.invalid/a.css">',
-    "font": "<style>@font-face { font-family: a; src: url(https://shown.invalid/a.woff2); } p { font: 1em a; }</style>",
-    "fetch": "<script>fetch('https://shown.invalid/a.json').catch(() => 0)</script>",
-}
-
-
-def test_the_page_asks_for_nothing_but_itself(browser, file, page, tmp_path):
-    assert requested(browser, file) == {file.as_uri()}
-    loading = tmp_path / "loading.html"
-    loading.write_text(page.replace("</body>", "".join(LOADERS.values()) + "</body>"), encoding="utf-8")
-    seen = requested(browser, loading)
-    assert {url.rpartition(".")[2] for url in seen} == {"html", "png", "js", "css", "woff2", "json"}
 
 
 def test_plots_are_drawn_and_nothing_sticks_out(tab):

@@ -9,7 +9,7 @@ from results_folder import C as COEFFICIENTS
 
 from mcc_jax.calibrate.curves import KINDS
 from mcc_jax.report import read_results
-from mcc_jax.report.chart import chart_data, compare
+from mcc_jax.report.chart import chart, compare
 from mcc_jax.report.checks import share_inside
 
 
@@ -90,6 +90,6 @@ def test_of_many_points_turns_stay_and_of_many_particles_the_worst(without_poste
 def test_rounding_in_the_page_does_not_show(shown):
     away = 1e-4 * np.random.default_rng(0).standard_normal(len(shown[0].own_um))
     one = dataclasses.replace(shown[0], displacement_um=shown[0].own_um + away)
-    column = chart_data([one], ["1"], [""])["particles"][0]
+    column = chart([one], ["1"], [""])["data"]["particles"][0]
     residual = np.array(column["displacement"]) - np.array(column["own"])
     np.testing.assert_allclose(residual, away, atol=2e-6)

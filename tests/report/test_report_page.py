@@ -102,12 +102,11 @@ def test_the_page_is_of_the_law_with_what_was_found_where_that_may_be_believed(r
         checks = {one.check: one for one in check_results(found.with_discovery, added)}
         assert (checks["Law is complete"].value, len(checks)) == (answer, len(check_results(found, alone)))
     for other in (results, with_posterior_of_the_found(results, NotConverged)):
-        assert other.with_found is None
         assert other.with_discovery is other
         assert "Effects that discovery added are not in these lines" in report_page(other)
     content = found.calibration | {"effects": [{"mechanism": "creep"}]}
-    other = dataclasses.replace(results, calibration=content)
-    assert with_posterior_of_the_found(other, WithWhatWasFound).with_found is None
+    other = with_posterior_of_the_found(dataclasses.replace(results, calibration=content), WithWhatWasFound)
+    assert other.with_discovery is other
 
 
 def test_sections_are_filled_and_the_page_is_whole(page):
@@ -191,23 +190,26 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
 
 
 @pytest.mark.parametrize(
-    ("verdict", "words"),
+    ("verdict", "sentence", "words"),
     [
-        ("NO_GAP", "nothing is missing from the law"),
-        ("NAMED", "The law misses frame compliance"),
-        ("SET", "or what looks like it"),
-        ("UNLISTED", "no listed mechanism explains"),
-        ("FIT_NOT_CONVERGED", "could not be fitted well enough"),
+        ("NO_GAP", "nothing is missing from the law", "Nothing missing"),
+        ("NAMED", "The law misses frame compliance", "Effect identified: frame compliance"),
+        ("SET", "or what looks like it", "Effect not unique: frame compliance or what looks like it"),
+        ("UNLISTED", "no listed mechanism explains", "Unlisted effect"),
+        ("FIT_NOT_CONVERGED", "could not be fitted well enough", "could not be fitted"),
     ],
 )
-def test_every_verdict_is_reported(folder, verdict, words):
+def test_every_verdict_is_reported(folder, verdict, sentence, words):
     keep(folder, "discovery")
     empty = {"effects": [], "candidate_set": [], "where": [], "next_experiments": [], "parameters_after": {}}
     closure = {"formula": "0.1 * x**2", "resembles": [["creep", 0.7]], "selection_frequency": 0.9}
     more = {"NO_GAP": empty, "UNLISTED": empty | {"closure": closure}, "FIT_NOT_CONVERGED": empty | {"ranking": []}}
-    text = text_of(changed(folder, "discovery.msgpack", verdict=verdict, **more.get(verdict, {})))
-    assert words in text
-    assert ("0.1 * x**2" in text) == (verdict == "UNLISTED")
+    sections = Page(
+        report_page(changed(folder, "discovery.msgpack", verdict=verdict, **more.get(verdict, {})))
+    ).sections
+    assert sentence in sections["summary"]
+    assert words in sections["discovery"]
+    assert ("0.1 * x**2" in sections["discovery"]) == (verdict == "UNLISTED")
 
 
 def test_the_first_screen_tells_verdict_gap_and_modulus(page):
@@ -381,7 +383,7 @@ def test_a_calibration_that_did_not_converge_is_no_green_page(folder):
     found = changed(folder, converged=False)
     assert check_results(found)[0].level == "bad"
     assert "NOT converge" in " ".join(calibration_sentences(found.calibration))
-    assert "does not fit these tests" in next_steps(found, "x")[0][0]
+    assert "does not fit these tests" in next(next_steps(found))[0]
     text = Page(report_page(found)).sections["summary"]
     assert "Not converged" in text
     assert "problem" in text
