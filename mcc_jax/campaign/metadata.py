@@ -35,15 +35,17 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
     """Parse TOML; the line with a mistake is named."""
     try:
         entries = tomllib.loads(text)
+        _refuse_long_integers(entries, file)
     except RecursionError:
         raise InputError("is nested too deep", file=file, remedy="Write flat keys") from None
+    except InputError:
+        raise
     except ValueError as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
         row = int(place[1]) if place else text.rstrip().count("\n") + 1
         remedy = 'Write key = value lines, text in double quotes, for example control = "load"'
         raise InputError(f"this is not TOML: {problem}", file=file, row=row, remedy=remedy) from None
-    _refuse_long_integers(entries, file)
     return entries
 
 

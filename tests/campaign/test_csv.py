@@ -156,6 +156,7 @@ BAD = {
     "forces all zero": (C, HEAD + "A,0,0,0\nA,1,0,1\n01,0,1,1\n01,1,1,1\n", ["row 2", "'force_mN'", "holds no data"]),
     "TOML broken": (T, 'control = "load"\nx = = 1\n', ["row 2", "not TOML", "double quotes"]),
     "TOML deep": (T, "x = " + "[" * 20_000, ["nested"]),
+    "TOML deep in keys": (T, "a." * 2000 + "b = 1", ["nested"]),
     "control unknown": (T, 'control = "force"', ["'control'", "'force'", '"displacement"']),
     "resolution negative": (T, "force_resolution_mN = -1", ["'force_resolution_mN'", "> 0"]),
     "punch huge": (T, "punch_diameter_um = 1" + "0" * 400, ["'punch_diameter_um'", "64 bits"]),

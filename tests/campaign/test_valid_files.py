@@ -351,12 +351,13 @@ def test_diameters_of_three_axes_before_every_test(tmp_path):
         ("Gage length,0.2,N", "no unit of length"),
         ("Gage length,,mm", "holds no number"),
         ("Gage length,0,mm", "not positive"),
+        ("Gage length,-,mm", "not positive"),
         ("Gage length,1,2,mm", "2 numbers"),
         ("Gauge,0.2,mm", "no row above the samples begins with 'Gage length'"),
     ],
 )
 def test_diameter_that_is_not_told(tmp_path, row, piece):
-    assert piece in told(tmp_path, row + "\n" + table(), "skip_rows = 1", SPHERE, None)
+    assert piece in told(tmp_path, row + "\n" + table(), 'skip_rows = 1\nmissing = ["-"]\n', SPHERE, None)
     assert_read(convert(tmp_path, row + "\n" + table(), "skip_rows = 1", SPHERE))
 
 

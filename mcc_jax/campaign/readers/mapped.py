@@ -337,8 +337,9 @@ class _Reader:
             if rest[:1].isalnum():
                 continue
             words = rest.replace(":", " ").replace("=", " ").split()
-            numbers = [word for word in words if self._reading(word) is not None]
-            units = [word.strip("[]()") for word in words if word not in numbers]
+            readings = [self._reading(word) for word in words]
+            numbers = [number for number in readings if number is not None]
+            units = [word.strip("[]()") for word, number in zip(words, readings, strict=True) if number is None]
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise self.wrong(problem, _OWN_DIAMETER, i)
@@ -347,10 +348,9 @@ class _Reader:
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
                 raise self.wrong(str(error), remedy, i, name) from None
-            value = self._number(numbers[0])
-            if not value > 0:
-                raise self.wrong(f"the diameter {value:g} is not positive", _OWN_DIAMETER, i, name)
-            return float(convert(np.array([value]), factor)[0])
+            if not numbers[0] > 0:
+                raise self.wrong(f"the diameter {numbers[0]:g} is not positive", _OWN_DIAMETER, i, name)
+            return float(convert(np.array(numbers), factor)[0])
         raise self.wrong(f"no row above the samples begins with {name!r}, for the diameter", _OWN_DIAMETER)
 
     # ---- tests -------------------------------------------------------------------------------------------------------
