@@ -335,9 +335,8 @@ def _problems(campaign: Campaign) -> Iterator[tuple[str, str]]:
 def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
     """The tests of several campaigns as one, for instance those that a discovery proposed in addition to those it had.
 
-    Programmes of load may differ. Of resolutions the coarsest counts, provenances are listed, and of further entries
-    of `campaign.toml` with one name the first campaign's stays. The same name twice, and different columns, control,
-    punch or corrections raise `InputError`.
+    Of resolutions the coarsest counts, provenances are listed, and of further entries with one name the first stays.
+    The same particle twice, and different columns, control, punch or corrections raise `InputError`.
     """
     campaigns = tuple(check_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
     for other in further:

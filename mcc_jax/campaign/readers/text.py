@@ -46,10 +46,8 @@ def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = N
 def number_block(
     lines: Sequence[str], at: Sequence[int], names: Sequence[str], file: Path, decimal_mark: str = "."
 ) -> dict[str, np.ndarray]:
-    """The columns, by name, of tab-separated numbers in the lines at some indices, each of shape (rows,).
-
-    Raises `InputError` if two columns have one name, or a row or cell is damaged.
-    """
+    """The columns, by name, of tab-separated numbers in the lines at some indices; `InputError` if two columns have one
+    name, or a row or cell is damaged."""
     check_header(names, file, at[0] if at else None, "Export the file again")
     records = [lines[i].rstrip("\t ").split("\t") for i in at]
     for i, cells in zip(at, records, strict=True):
