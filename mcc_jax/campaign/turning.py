@@ -1,8 +1,5 @@
-"""The force at which each branch of a test begins, estimated from the ramp or the hold around it, with its error.
-
-The largest of many noisy readings lies above the force that was reached, from which the law unloads: a turning point is
-where the ramps before and behind it meet, or the mean of the hold between them.
-"""
+"""The force at which each branch of a test begins, with its error: where the ramps before and behind it meet, or the
+mean of the hold between them. The largest of many noisy readings lies above the force from which the law unloads."""
 
 from __future__ import annotations
 

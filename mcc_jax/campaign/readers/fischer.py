@@ -25,8 +25,8 @@ def matches(lines: list[str]) -> bool:
 
 
 def read(lines: list[str], file: Path) -> Tests:
-    """All tests of an export, named by their value number (`block-value` if there are several blocks); `InputError` if a
-    test is cut off, damaged or missing."""
+    """All tests, named by their value number (`block-value` if there are several blocks); an error if one is cut off,
+    damaged or missing."""
     found = {i: match.groups() for i, line in enumerate(lines) if (match := _TEST.match(line))}
     starts, labels = list(found), list(found.values())
     single = len({block for block, _ in labels}) == 1

@@ -40,10 +40,7 @@ _Reading = float | None  # NaN where it is marked as missing, None where the cel
 
 
 def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
-    """The tests of a file that a mapping describes.
-
-    Raises `InputError` if the file does not hold what the mapping says, or a cell is damaged.
-    """
+    """The tests of a file; `InputError` if it does not hold what the mapping says, or a cell is damaged."""
     reader, name = _Reader(_Rows(data, file, mapping), file, mapping), mapping.file.name
     reader.read()
     if not reader.has_data:
