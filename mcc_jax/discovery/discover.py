@@ -62,19 +62,14 @@ def discover(
     Args:
         campaign: the tests.
         model: form of unloading and priors, without effects; the modulus may always scatter between particles.
-        library: mechanisms to look for; the whole `mcc_jax.effects.LIBRARY` if None.
-        exclude: names of mechanisms to leave out.
+        library, exclude: mechanisms to look for, the whole `mcc_jax.effects.LIBRARY` if None, and names to leave out.
         threshold_MPa: points below this stress do not count [MPa]. All count by default, unlike in a calibration: what
             surface asperities do is an effect of its own, and at low load many effects show most.
         confirm: choose and fit again without each particle, and see how far that particle is then from the law.
         experiments: work out which further test would separate the members of a set.
-        posterior: sample the posterior of the law with what was found; without it, amplitudes and parameters come with
-            the standard errors of the linear model.
+        posterior: sample the posterior of the law with what was found, in place of errors of the linear model.
         seed: of the bootstrap and the sampler.
         progress: called with the name of each step.
-
-    Returns:
-        The answer; "nothing is missing" and "cannot tell" are answers, too.
 
     Raises:
         InputError: if no particle can be used, a name to exclude is not known, or no mechanism is left to look for.

@@ -67,12 +67,6 @@ class Fitted:
             Noise.from_logs(jnp.asarray(hyper[:4]), jnp.asarray(base.scale)),
         )
 
-    @property
-    def curves_um(self) -> np.ndarray:
-        """What every formula adds to the displacement of every test, to first order [um]."""
-        units = np.array([v.plausible[0] for v in self.variants])
-        return self.design.amplitude[..., : len(units)] * (self.theta[: len(units)] / units)
-
 
 def fit_hypothesis(
     base: Base,

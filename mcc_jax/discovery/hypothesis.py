@@ -92,7 +92,8 @@ def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, 
     """
     r = one.at
     assert r is not None
-    names, curves, more = len(r.variants), r.curves_um, NO_EXTRA
+    names, units, more = len(r.variants), np.array([v.plausible[0] for v in r.variants]), NO_EXTRA
+    curves = r.design.amplitude[..., :names] * (r.theta[:names] / units)  # what every formula adds to the tests [um]
     misfits = [columns_of(v, curves[..., i]) for i, v in enumerate(r.variants)]
     # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
     seen = list(visible(r.optimum.hyper, r.design, curves))
@@ -115,7 +116,7 @@ def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, 
     start = np.concatenate([r.optimum.hyper, [scatter] * names, design.misfits[:, 0]])
     optimum = optimise(design, start, without=r.optimum)
     sizes, shift = design.misfits, np.zeros(len(misfits))
-    units, alone = [v.plausible[0] for v in r.variants], np.maximum(np.abs(r.theta[:names]), 1e-300)
+    alone = np.maximum(np.abs(r.theta[:names]), 1e-300)
     for _ in range(FOLLOWED):
         amplitudes = np.abs(LinearModel(optimum.hyper, design).solve().amplitude[:names] * units)
         away = -shift  # of a test's own numbers the prior stays
