@@ -222,7 +222,7 @@ def _explicit(positions: Array, coordinates: FitCoordinates) -> tuple[Any, ...]:
 
 def _nuts(
     key: Array, coordinates: FitCoordinates, length: Length, accept: float, depth: int
-) -> tuple[Array, dict[str, float]]:
+) -> tuple[Array, dict[str, Any]]:
     """Draws of the coordinates by NUTS, all chains in a row; divergences, and leapfrog steps a draw."""
     keys = jax.random.split(key, length.chains)
     z, divergent, steps = _chains(keys, coordinates, length.warmup, length.draws, accept, depth)
