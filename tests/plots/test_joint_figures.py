@@ -27,7 +27,7 @@ from mcc_jax.plots.posterior import CoefficientTable, density, draw_forest, prio
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
-KINDS = ("paper", "one", "odd")
+KINDS = ("paper", "one")
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
 
 pytestmark = pytest.mark.extended
@@ -45,14 +45,8 @@ class Calibrations(dict):
 
 @pytest.fixture(scope="module")
 def calibrations(paper_posterior):
-    """Posterior and least squares of 20 particles, of one, and of 20 of which some have odd names."""
-    campaign = paper_campaign(0)
-    found = Calibrations(paper=(paper_posterior, least_squares(campaign)))
-    names = list(campaign.particles)
-    names[:4] = "$x_1$ <b>", "a_b^c", "a very long name of a particle of the second batch", "中文"
-    renamed = dataclasses.replace(campaign, particles=tuple(names))
-    found["odd"] = tuple(dataclasses.replace(c, campaign=renamed) for c in found["paper"])
-    return found
+    """Posterior and least squares of 20 particles, and of one."""
+    return Calibrations(paper=(paper_posterior, least_squares(paper_campaign(0))))
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -96,14 +90,6 @@ def test_every_figure_has_its_panels(figures, kind):
 def test_words_and_layout(figures):
     check_words(figures)
     check_layout(figures, ticks=True)
-
-
-def test_names_are_drawn_as_they_stand(calibrations):
-    posterior, squares = calibrations["odd"]
-    for figure in (plot_bands(posterior), plot_fits(squares)):
-        shown = texts(figure)
-        assert any(t.startswith("\\$x_1\\$ <b>\n") for t in shown)
-        assert any(t.startswith("\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER} (no. 4)\n") for t in shown)
 
 
 @pytest.mark.extended
