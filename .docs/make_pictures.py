@@ -100,12 +100,12 @@ def found():
     answer = discover(campaign.select(np.arange(20) < 8), experiments=False, posterior=False)
     print(answer.summary)
     before, after = (step["chi2_per_dof"] for step in answer.gap()["steps"])
-    told = most_informative_test(answer)
+    proposed = most_informative_test(answer)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
-    handles = draw_enlarged(left, told)
+    handles = draw_enlarged(left, proposed)
     text = "A simulated particle with creep put in, pressed three times:\nthe contact law alone misses the loop"
     left.set_title(text, fontsize=9, loc="left")
-    noise = draw_left_over(right, told)[0]
+    noise = draw_left_over(right, proposed)[0]
     gap = f"(χ² per point {before:.0f} → {after:.1f}; 1 is noise)"
     text = f"The whole test over time: with creep added only noise is left\n{gap}"
     right.set_title(text, fontsize=9, loc="left")

@@ -148,7 +148,7 @@ def calibrate_many(
     progress: Callable[[int, str], None] | None = None,
     **settings: Any,
 ) -> list[Posterior | LeastSquares | Exception]:
-    """Calibrate many campaigns, one after another; in place of one that fails stands its exception.
+    """Calibrate many campaigns, one after another; for one that fails the list holds its exception.
 
     Campaigns of similar size share one compilation: every calibration pads its campaign to one of few sizes, with
     copies of a particle that count for nothing and with masked points. So every result is that of `sample` or
