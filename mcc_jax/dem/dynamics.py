@@ -19,7 +19,7 @@ from .. import arguments
 from .._format import described
 from .._numerics import recompute
 from .forces import Forces, Motion, bodies_of, contact_forces, pair_loads, wall_loads
-from .neighbours import PADDING, Edges, pad_rows, stacked_lists, with_list
+from .neighbours import PADDING, Edges, stacked_lists, with_list
 from .pair import wall_force, wall_recovery
 from .state import Packing, State, WallHistory, check_state, measured, rebuild_list
 from .walls import Walls, set_velocity
@@ -311,9 +311,13 @@ def _remembered(state: Any) -> tuple[jax.Array, ...]:
 
 def _padded(state: Any, parts: int) -> Any:
     """The state with as many edges, and rows of contacts with walls, as divide among the parts."""
+
+    def longer(x: Array, value: int = 0) -> Array:
+        missing = parts * math.ceil(len(x) / parts) - len(x)
+        return jnp.pad(x, [(0, missing), *[(0, 0)] * (x.ndim - 1)], constant_values=value)
+
     key, *others = _sharded_leaves(state)
-    longer = (pad_rows(x, parts * math.ceil(len(x) / parts)) for x in others)
-    return eqx.tree_at(_sharded_leaves, state, (pad_rows(key, parts * math.ceil(len(key) / parts), PADDING), *longer))
+    return eqx.tree_at(_sharded_leaves, state, (longer(key, PADDING), *map(longer, others)))
 
 
 def _share_of_contacts(packing: Packing, _: Packing, motion: Motion, state: State) -> tuple[Forces, Edges, WallHistory]:

@@ -169,11 +169,7 @@ def stacked_lists[Recorded: Any](tape: Sequence[Recorded]) -> Recorded:
     longest = max(step.key.shape[0] for step in tape)
     padded = []
     for step in tape:
-        key, i, j = pad_rows(step.key, longest, PADDING), pad_rows(step.i, longest), pad_rows(step.j, longest)
-        padded.append(step._replace(key=key, i=i, j=j))
+        missing = 0, longest - step.key.shape[0]
+        key = np.pad(step.key, missing, constant_values=PADDING)  # in NumPy: the tape is known while JAX traces
+        padded.append(step._replace(key=key, i=np.pad(step.i, missing), j=np.pad(step.j, missing)))
     return type(tape[0])(*(jnp.asarray(np.stack(column)) for column in zip(*padded, strict=True)))
-
-
-def pad_rows(x: Array, rows: int, value: int = 0) -> Array:
-    """An array with so many rows, the new ones filled with a value."""
-    return jnp.pad(x, [(0, rows - len(x)), *[(0, 0)] * (x.ndim - 1)], constant_values=value)

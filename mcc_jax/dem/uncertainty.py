@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -65,8 +64,9 @@ class Sensitivity(NamedTuple):
 def rescaled(packing: Packing, log_scale: Float[Array, " 4"]) -> Packing:
     """The packing with K1 = C1, K3 = C3^3, K5 = C5^5 and Ebar of all particles times :math:`e^{s}`."""
     sides, (k1, k3, k5, modulus) = packing.sides, jnp.exp(log_scale)
-    c = sides.c / modulus**sides.power
-    return replace(packing, sides=replace(sides, k1=sides.k1 * k1, k3=sides.k3 * k3, k5=sides.k5 * k5, c=c))
+    scaled = sides.k1 * k1, sides.k3 * k3, sides.k5 * k5, sides.c / modulus**sides.power
+    # Not by `replace`: the constructor takes one half contact and not a batch.
+    return eqx.tree_at(lambda p: (p.sides.k1, p.sides.k3, p.sides.k5, p.sides.c), packing, scaled)
 
 
 def punch_sensitivity(
