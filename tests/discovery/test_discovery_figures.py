@@ -22,6 +22,7 @@ def found():
 
 
 def texts(figure):
+    figure.draw_without_rendering()  # ticks have no words before
     return [t.get_text() for t in figure.findobj(mpl.text.Text) if t.get_text()]
 
 
