@@ -49,12 +49,12 @@ def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray
 
     `rms_um` are root mean square residuals and `range_um` the ranges of displacement of all particles [um].
     """
-    rms, reach = np.asarray(rms_um, float), np.asarray(range_um, float)
-    known = np.isfinite(rms) & (rms > 0) & (reach > 0)
+    rms = np.asarray(rms_um, float)
+    known = np.isfinite(rms) & (rms > 0) & (range_um > 0)
     if known.sum() < LEAST:
         return None
     far = np.zeros(len(rms), bool)
-    logs = np.log([rms[known], rms[known] / reach[known]])
+    logs = np.log([rms[known], rms[known] / range_um[known]])
     away = logs - np.median(logs, axis=1, keepdims=True)
     spread = 1.4826 * np.median(np.abs(away), axis=1, keepdims=True)
     far[known] = np.all(away > np.maximum(OUTLYING * spread, np.log(TIMES)), axis=0)
@@ -64,13 +64,8 @@ def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray
     times = rms[far] / np.median(rms[known])
     low, high = f"{times.min():.2g}", f"{times.max():.2g}"
     text = f"{named(which, len(names))}: the residual is {low if low == high else f'{low} to {high}'} times the others'"
-    return Finding(
-        "unlike the others",
-        "warning",
-        text,
-        "Look at the curve, and leave the particle out if it is not a valid test",
-        which,
-    )
+    remedy = "Look at the curve, and leave the particle out if it is not a valid test"
+    return Finding("unlike the others", "warning", text, remedy, which)
 
 
 def unknown_modulus(campaign: Campaign, modulus: Mapping[str, Any]) -> Finding | None:
@@ -112,14 +107,13 @@ def judged(
         outlying: what `unlike_others` found.
         again: calibrates a campaign and gives the same numbers; None to leave the answers without them out.
     """
-    found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
     modulus = answer["effective_modulus_MPa"]
-    if not answer.get("converged", True):
+    if not answer["converged"]:
         modulus = {**modulus, "interval_95": None}  # not to be believed, so not reported
     unknown = unknown_modulus(campaign, modulus)
     value = modulus["value"] if unknown is None else None  # what is not known cannot be implausible
-    found += [] if unknown is None else [unknown]
-    found += check_plausibility(campaign, modulus_MPa=value)
+    plausibility = check_plausibility(campaign, modulus_MPa=value)
+    found = [one for one in (*campaign_findings(campaign), outlying, unknown, *plausibility) if one is not None]
     if again is None:
         return tuple(found)
 
@@ -171,6 +165,6 @@ def _answer(content: Mapping[str, Any]) -> str:
             return "unknown"
         return f"{factor * value:.4g}" + ("" if sd is None else f" +- {factor * sd:.2g}")
 
-    modulus, end = content["effective_modulus_MPa"], "" if content.get("converged", True) else " (not converged)"
+    modulus, end = content["effective_modulus_MPa"], "" if content["converged"] else " (not converged)"
     known = modulus["value"] is not None and not is_unknown(modulus)
     return f"the modulus is {f'{pair(modulus, 1e-3)} GPa' if known else 'unknown'} and a {pair(content['a'])}{end}"

@@ -113,11 +113,7 @@ class LeastSquares(JointCalibration):
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
         a, modulus = ((float(self.solution.value.shared[k]), self._reported_sd[k]) for k in range(2))
-        return {
-            "converged": self.converged,
-            "a": normal_estimate(*a),
-            "effective_modulus_MPa": log_estimate(*modulus),
-        }
+        return {"converged": self.converged, "a": normal_estimate(*a), "effective_modulus_MPa": log_estimate(*modulus)}
 
     def _further_content(self) -> dict[str, Any]:
         tests = self.selection.tests
@@ -146,6 +142,8 @@ class LeastSquares(JointCalibration):
             return found
 
         tau, steps = np.asarray(self.settings.population.tau), int(self.solution.steps)
+        freedom = max(int(np.asarray(tests.mask).sum()) - 4 * len(self.selection.kept) - 5, 1)
+        chi2 = np.sum(np.asarray(self.solution.residual[0]) ** 2) / freedom
         return {
             "reason": " ".join(self.failures()) or f"the tolerances were met after {steps} steps",
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
@@ -167,7 +165,7 @@ class LeastSquares(JointCalibration):
                 **NO_SAMPLER,
                 "steps": steps,
                 "loss": finite(float(self.solution.loss)),
-                "chi2_per_dof": finite(self._chi2()),
+                "chi2_per_dof": finite(chi2),
                 "noise_share": finite(self.noise_share),
                 "own_misfit": finite(self.own_misfit),
                 "singular_values": [float(v) for v in self.identifiability.singular_values],
@@ -225,11 +223,6 @@ class LeastSquares(JointCalibration):
         for j, name in enumerate(self.model.varying_places):
             found[f"tau_{name}"] = estimate(float(self.settings.population.theta_scatter[j]))
         return found
-
-    def _chi2(self) -> float:
-        used = int(np.asarray(self.selection.tests.mask).sum())
-        freedom = max(used - 4 * len(self.selection.kept) - 5, 1)
-        return float(np.sum(np.asarray(self.solution.residual[0]) ** 2) / freedom)
 
 
 @one_blas_thread

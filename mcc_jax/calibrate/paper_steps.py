@@ -129,29 +129,32 @@ def _square(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack([np.sum(weights * product, -1) for product in (x * x, 2 * x * y, y * y)])
 
 
-def full_objective(strain: np.ndarray, weights: np.ndarray, reached: np.ndarray, flatness: np.ndarray) -> Quadratics:
+def full_objective(table: StrainTable) -> Quadratics:
     r"""The paper's full objective (eq. 14): of every particle a ratio of two quadratics in `a`.
 
     .. math:: \sum_i \frac{\int \left[\bar\epsilon(\sigma) - \eta_{p,i} \epsilon_i(\sigma)\right]^2 d\sigma}
         {\int \bar\epsilon(\sigma)^2 d\sigma}, \qquad \bar\epsilon = \frac{1}{\#S_\sigma}\sum_{j\in S_\sigma}
         \eta_{p,j}\epsilon_j
     """
-    parts = strain, flatness[:, None] * strain
+    reached = table.reached & table.enough
+    weights = integration_weights(table.stress_MPa, reached)
+    parts = table.strain, table.flatness[:, None] * table.strain
     means = [np.sum(part, 0, where=reached) / np.maximum(reached.sum(0), 1) for part in parts]
     away = [np.where(reached, mean - part, 0.0) for mean, part in zip(means, parts, strict=True)]
     return _square(weights, *away), _square(weights, *means)
 
 
-def reference_objective(strain: np.ndarray, weights: np.ndarray, flatness: np.ndarray, row: int) -> Quadratics:
+def reference_objective(table: StrainTable, row: int) -> Quadratics:
     r"""The paper's objective with a reference particle N (eq. 15), in the row-th place.
 
     .. math:: \sum_{i \ne N} \frac{\int \left[\epsilon_N(\sigma) - \frac{\eta_{p,i}}{\eta_{p,N}}
     \epsilon_i(\sigma)\right]^2 d\sigma}
         {\int \epsilon_N(\sigma)^2 d\sigma}
     """
-    parts = strain, flatness[:, None] * strain
-    scaled = strain[row], flatness[row] * strain[row]
-    return _square(weights, *(x[row] - x for x in parts)), _square(weights, *scaled)
+    reached = table.reached & table.enough
+    weights = integration_weights(table.stress_MPa, reached & reached[row])
+    parts = table.strain, table.flatness[:, None] * table.strain
+    return _square(weights, *(x[row] - x for x in parts)), _square(weights, *(x[row] for x in parts))
 
 
 def objective_at(a: Any, quadratics: Quadratics) -> Any:
@@ -186,15 +189,12 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
     arguments.choice(objective, get_args(Objective), "objective")
     if len(table.index) < 2:
         raise InputError("the shape parameter needs at least two particles")
-    stress, strain, flatness = table.stress_MPa, table.strain, table.flatness
-    reached = table.reached & table.enough
+    flatness = table.flatness
     if objective == "full":
-        reference = None
-        quadratics = full_objective(strain, integration_weights(stress, reached), reached, flatness)
+        reference, quadratics = None, full_objective(table)
     else:
         row = choose_reference(table) if reference is None else int(np.flatnonzero(table.index == reference)[0])
-        reference = int(table.index[row])
-        quadratics = reference_objective(strain, integration_weights(stress, reached & reached[row]), flatness, row)
+        reference, quadratics = int(table.index[row]), reference_objective(table, row)
     # A shape factor that is not positive turns the particle inside out; such a minimum is none.
     most, least, far = flatness.max(), flatness.min(), FAR / max(np.abs(flatness).max(), 1e-9)
     grid = np.linspace(-1 / most if most > 0 else -far, -1 / least if least < 0 else far, GRID + 2)[1:-1]

@@ -42,7 +42,7 @@ def test_what_fills_up_counts_for_nothing(result, monkeypatch):
     few = result.campaign.select(np.arange(20) < 5)
     numbers = []
     for size in (5, 20):
-        monkeypatch.setattr(sharding, "BLOCKS", (size,))
+        monkeypatch.setattr(sharding, "BLOCK", size)
         found = calibrate_paper(few)
         numbers.append([number for one in found.particles for number in (*one.plastic, one.rms_um)])
     np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-8)

@@ -253,7 +253,7 @@ def test_a_fitted_modulus_of_no_solid_is_reported_and_accuses_no_unit(name, modu
     assert [(f.check, f.level) for f in bad] == [("fitted modulus", "error")]
     assert not ACCUSES.search(str(bad[0]))
     assert not accusing(check_plausibility(tests, modulus_MPa=16e3))
-    answer = {"effective_modulus_MPa": {"value": modulus, "sd": None}}
+    answer = {"converged": True, "effective_modulus_MPa": {"value": modulus, "sd": None}}
     assert bad == [f for f in judged(tests, answer, None, None) if f.level == "error"]  # as every method asks
 
 
