@@ -40,7 +40,7 @@ from .sharding import Blocks, require_same
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
 ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is allowed around the prior's centre
 NARROWEST = 1e-3  # least such standard deviation under the population: any smaller is badly scaled
-NOISE_BLOCKS = 4  # the noise of campaigns of more blocks is estimated from the particles of so many
+NOISE_PARTICLES = 256  # of larger campaigns the noise is estimated from so many particles
 ROUNDS, MOST_ROUNDS = 2, 20  # turns of noise, population and particles: at least, and at most, with effects
 LEAST_GAIN = 0.005  # log density to gain below which effects are not linearised again: a tenth of an sd
 HALVINGS = 8  # most halvings of a step of a model with effects until it raises the density
@@ -187,8 +187,8 @@ class _Fitter:
         # Without what is never read, so that all models share a program.
         linear = replace(self.linear, columns=self.linear.columns[..., :4], bends=None)
         given: Any = old.scale, self.tests, linear
-        if blocks.number > NOISE_BLOCKS:
-            rows = np.linspace(0, len(self.tests) - 1, NOISE_BLOCKS * blocks.size).astype(int)
+        if len(self.tests) > NOISE_PARTICLES:
+            rows = np.linspace(0, len(self.tests) - 1, NOISE_PARTICLES).astype(int)
             blocks = Blocks(len(rows), blocks.size)
             given = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), given)
         shared = m.zero_prior[1], m.correlation, m.along

@@ -102,19 +102,15 @@ class Point(eqx.Module):
 
 
 class Linear(eqx.Module):
-    """Residuals of N tests [um], linear in everything the prediction depends on, 0 where masked.
-
-    `columns` are derivatives of the prediction by b1, b3, b5, e and the effects' numbers; `by_force`, `by_peak` and
-    `by_offset` by a point's own reading of force, the force from which its branch starts, and an error that all forces
-    of a test share [um/mN]. `bends` are derivatives of the columns by each of the effects' numbers, one number after
-    the other; None for a law without effects.
-    """
+    """Tests linear in everything the prediction depends on, 0 where masked: residuals [um], and derivatives of the
+    prediction, by forces in um/mN."""
 
     residual: Float[Array, "particles points"]
-    columns: Float[Array, "particles points numbers"]
-    by_force: Float[Array, "particles points"]
-    by_peak: Float[Array, "particles points"]
-    by_offset: Float[Array, "particles points"]
+    columns: Float[Array, "particles points numbers"]  # by b1, b3, b5, e and the effects' numbers
+    by_force: Float[Array, "particles points"]  # by a point's own reading
+    by_peak: Float[Array, "particles points"]  # by the force from which its branch starts
+    by_offset: Float[Array, "particles points"]  # by an error that all forces of a test share
+    # derivatives of the columns by each of the effects' numbers, one after the other; None for a law without effects
     bends: Float[Array, "particles points bends"] | None = None
 
 
