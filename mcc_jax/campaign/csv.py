@@ -68,6 +68,10 @@ def _check_folder(path: Path) -> None:
             found = first_few(there, 8) or "nothing"
             remedy = f"Expected: {expected} (mcc-jax convert makes one of an instrument file); found: {found}"
             raise InputError(f"{name} is missing", file=path, remedy=remedy)
+    # Editors add ".txt" and some systems change the case: what it says must not be left out in silence.
+    for name in there:
+        if name.lower().removesuffix(".txt") == METADATA and METADATA not in there:
+            raise InputError(f"{name} would not be read", file=path, remedy=f"Rename it to {METADATA}.")
 
 
 def read_particles(

@@ -187,6 +187,10 @@ def test_bad_folders(tmp_path):
     (folder / "curves.csv").rename(folder / "Curves.CSV")
     assert "curves.csv is missing" in message(folder)
     assert "found: Curves.CSV, particles.csv" in message(folder)
+    for name in ("campaign.toml.txt", "Campaign.toml"):  # as editors and systems write it
+        other = make(tmp_path / name)
+        (other / name).write_text("protocol = 'x'")
+        assert f"{name} would not be read" in message(other)
     (tmp_path / "empty").mkdir()
     assert "found: nothing" in message(tmp_path / "empty")
     (folder / "curves.csv").mkdir()
