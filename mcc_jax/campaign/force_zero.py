@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -65,10 +66,11 @@ class ZeroOfForce(NamedTuple):
 
 
 def zero_of_force(
-    curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None = None
+    curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None, tests: int
 ) -> ZeroOfForce | None:
     """The force that is read before contact; None if nothing shows another zero than the file's own.
 
+    `zero_mN` is the zero that all tests share, if they do, and its error; `tests` how many the campaign has.
     Without a drift it is the readings' mean. With a drift it is their line over time up to contact, and its value there
     from then on; the drift during the test is unknown, so its change before contact is the error.
     """
@@ -78,7 +80,7 @@ def zero_of_force(
         # A rise before loading that is too quick to be taken for a drift, and too straight for a contact.
         if abs(change) > least:
             return ZeroOfForce(0.0, 0.0, 0.0, PERHAPS_DRIFT.of(change))
-        return _begins_elsewhere(curve, zero_mN, least)
+        return _begins_elsewhere(curve, zero_mN, least, tests)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(AIR_READINGS, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
@@ -94,6 +96,13 @@ def zero_of_force(
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
     reported = abs(mean) > max(AIR_SAID * error, least)
     return ZeroOfForce(mean, mean, error, OFFSET.of(mean) if reported else None)
+
+
+def unusual(tests: int) -> float:
+    """Standard deviations that the farthest of so many noisy readings passes as rarely as one alone passes `AIR_SAID`
+    (Sidak 1967, J. Am. Stat. Assoc. 62, 626): of many tests a few begin far from zero by chance."""
+    normal = NormalDist()
+    return normal.inv_cdf(normal.cdf(AIR_SAID) ** (1 / tests))
 
 
 def open_zero(campaign: Campaign) -> tuple[float, float] | None:
@@ -115,13 +124,14 @@ def shared_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float]
     begins = np.array([curve.force_mN[0] + off for curve, off in zip(curves, taken_off, strict=True)])
     steps = np.array([_first_steps(curve) for curve in curves])
     noise = max(point_noise(curve.force_mN) for curve in curves)
+    chance = unusual(len(curves)) * noise
     lowest = int(np.argmin(begins))
     zero, error = float(begins[lowest]), float(steps[lowest] / np.sqrt(12))
     if len(curves) > 2 and np.all(steps > noise):
         line = Line.through(1 / steps, begins / steps)
-        if line.spread > 0 and line.slope_sd < error and line.slope <= zero:
+        if line.spread > 0 and line.slope_sd < error and line.slope <= zero + chance:
             zero, error = line.slope, max(line.slope_sd, noise / np.sqrt(len(steps)))
-    return (zero, error) if np.all(begins - zero <= steps + AIR_SAID * noise) else None
+    return (zero, error) if np.all(begins - zero <= steps + chance) else None
 
 
 def _first_steps(curve: Curve) -> float:
@@ -129,13 +139,15 @@ def _first_steps(curve: Curve) -> float:
     return median(np.abs(differences(curve.force_mN[: AIR_READINGS + 1])))
 
 
-def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None, least: float) -> ZeroOfForce | None:
+def _begins_elsewhere(
+    curve: Curve, zero_mN: tuple[float, float] | None, least: float, tests: int
+) -> ZeroOfForce | None:
     """A record in contact whose first reading is below zero, or more than a step of the ramp above it."""
     first = float(curve.force_mN[0])
     if zero_mN is not None:
         zero, error = zero_mN
         return ZeroOfForce(zero, zero, error, NOT_TARED.of(first, zero) if zero < 0 else None)
-    least = max(least, AIR_SAID * point_noise(curve.force_mN))
+    least = max(least, unusual(tests) * point_noise(curve.force_mN))
     # A record that begins far from zero has lost its loading, and shows no zero at all.
     if -least <= first <= _first_steps(curve) + least or abs(first) > START_SHARE * float(curve.force_mN.max()):
         return None

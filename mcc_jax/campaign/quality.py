@@ -82,7 +82,7 @@ def check_tests(campaign: Campaign, *, zero_mN: tuple[float, float] | None = Non
     if wrong_signs(campaign):
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
     control = campaign.metadata.control
-    curves = tuple(_check_test(curve, control, zero_mN) for curve in campaign.curves)
+    curves = tuple(_check_test(curve, control, zero_mN, len(campaign)) for curve in campaign.curves)
     zero = shared_zero(curves, NOT_TARED) if zero_mN is None else None
     if zero is not None:
         return check_tests(campaign, zero_mN=zero)
@@ -96,7 +96,7 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
     return joined({name: () if one is None else one.findings for name, one in checked})
 
 
-def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None) -> Curve:
+def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None, tests: int) -> Curve:
     clean, rows = curve, np.arange(len(curve))
     found: list[Finding] = []
 
@@ -120,7 +120,7 @@ def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, flo
     gone = gives_way(clean, control)
     leave_out(gone, GIVES_WAY.of(float(clean.force_mN[np.argmax(gone) - 1]), int(gone.sum())))
     value, sd = 0.0, 0.0
-    if (zero := zero_of_force(clean, control, zero_mN)) is not None:
+    if (zero := zero_of_force(clean, control, zero_mN, tests)) is not None:
         value, sd = zero.value, zero.sd
         found += [] if zero.finding is None else [zero.finding]
         clean = replace(clean, force_mN=clean.force_mN - zero.path)

@@ -9,7 +9,7 @@ from faulty import exact, noisy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax.campaign import Finding, campaign_findings, check_tests
+from mcc_jax.campaign import Campaign, Finding, campaign_findings, check_tests
 from mcc_jax.campaign.findings import worst
 from mcc_jax.campaign.force_zero import open_zero
 
@@ -151,6 +151,18 @@ def test_tests_that_share_no_zero_are_taken_one_by_one():
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_record_that_begins_within_a_step_of_its_ramp_is_not_remarked(share):
     checked = check_tests(shifted(noisy(exact(), 0), 0.0, share))
+    assert campaign_findings(checked) == ()
+    assert open_zero(checked) is None
+
+
+def test_of_many_tests_some_begin_far_from_zero_by_chance():
+    """One of a thousand noisy first readings lies below three standard deviations: that shifts no zero."""
+    campaign = exact()
+    curves = tuple(curve for seed in range(60) for curve in noisy(campaign, seed).curves)
+    names = tuple(f"P{k}" for k in range(len(curves)))
+    many = Campaign(names, np.tile(campaign.diameters_um, (60, 1)), curves)
+    assert min(float(curve.force_mN[0]) for curve in curves) < -3 * 0.05
+    checked = check_tests(many)
     assert campaign_findings(checked) == ()
     assert open_zero(checked) is None
 
