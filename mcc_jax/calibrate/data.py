@@ -46,7 +46,7 @@ LEAST_POINTS = 12  # fewer usable points cannot carry three coefficients, a zero
 # turning points that are always kept would be most of what is left.
 TURNS_SHARE = 4
 # Records are padded to one of these lengths, beyond them in steps of the last: similar campaigns share a compilation.
-LENGTHS = (64, 192, 448)
+LENGTHS = (64, 128, 192, 320, 448)
 
 
 class Tests(eqx.Module):

@@ -28,22 +28,24 @@ from .data import Tests
 
 AXIS = "particles"  # the only axis of the mesh of a process's devices
 
-# Particles of a block: few, so that campaigns of every size share their programs; more where there are many of them, or
-# on an accelerator, since every call takes time of its own (`bench_scale.py`).
-BLOCK, LARGE_BLOCK = 8, 64
-# What concerns the population is padded to a multiple of so many particles: it is little work, and dear to compile.
-POPULATION = 32
+# Sizes of a campaign that is one block: those between are padded, so that few sizes are compiled. The last is the
+# most particles of a block: on a processor larger ones are no faster, smaller ones slower (`bench_scale.py`).
+BLOCKS = (4, 8, 12, 16, 20, 24, 32, 40, 48, 64)
 
 
 def block_size(count: int) -> int:
     """Particles of each block of a campaign of that many."""
-    return BLOCK if count <= LARGE_BLOCK and jax.default_backend() == "cpu" else LARGE_BLOCK
+    most = BLOCKS[-1]
+    if count <= most:
+        return next(size for size in BLOCKS if size >= count)
+    size = -(-count // -(-count // most))
+    return size + -size % 4
 
 
 def padded(tree: Any) -> tuple[Any, np.ndarray]:
-    """Arrays of particles with copies of the last up to one of few lengths, and weights: 1, and 0 of the copies."""
+    """Arrays of particles with copies of the last one up to whole blocks, and weights: 1 of particles, 0 of copies."""
     count = len(jax.tree.leaves(tree)[0])
-    rows = np.arange(count + -count % (POPULATION if count <= LARGE_BLOCK else LARGE_BLOCK))
+    rows = np.arange(count + -count % block_size(count))
 
     def longer(x: Any) -> Any:
         x = x if is_traced(x) else np.asarray(x)  # of NumPy, so that nothing is compiled

@@ -20,9 +20,11 @@ from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.numpyro_model import Model
 from ..calibrate.particle_fit import snaps
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
-from ..calibrate.sharding import BLOCK, Blocks
+from ..calibrate.sharding import Blocks
 from ..campaign import Campaign, find_segments
 from .settings import DECISIONS
+
+BLOCK = 8  # particles that are linearised at once: one program for any number of them
 
 
 class State(eqx.Module):

@@ -81,7 +81,7 @@ def test_least_squares_in_a_queue_are_those_of_one_by_one(campaigns):
 
 
 def test_records_are_padded_to_few_lengths():
-    assert [padded_length(n) for n in (1, 64, 65, 301, 448, 449)] == [64, 64, 192, 448, 448, 896]
+    assert [padded_length(n) for n in (1, 64, 65, 301, 448, 449)] == [64, 64, 128, 320, 448, 896]
     assert all(padded_length(n) == n for n in LENGTHS)
 
 
