@@ -41,9 +41,11 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int, ev
     # Not before: nothing may ask for devices before the processes know of each other.
     from joint_cases import five_particles
 
-    from mcc_jax.calibrate import posterior, sample, sharding
+    from mcc_jax.calibrate import fitting, posterior, sample
+    from mcc_jax.calibrate.sharding import Blocks
 
-    posterior.block_size = sharding.block_size = lambda count: 2
+    fitting.Blocks = lambda count, size=2: Blocks(count, size)
+    posterior.block_size = lambda count: 2
     campaign = five_particles(seed)
     try:
         found = sample(campaign, chains=2, warmup=100, draws=60, seed=3)
