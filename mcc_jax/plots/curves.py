@@ -156,6 +156,11 @@ def plot_fits(calibration: LeastSquares) -> Figure:
     return _draw_kept(calibration, "Measured and fitted", "fitted")
 
 
+def pages_of(calibration: PaperCalibration) -> int:
+    """How many pages `plot_particles` has of a calibration."""
+    return -(-len(calibration.campaign) // PAGE)
+
+
 @style.styled
 def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     """Force [mN] over displacement [um], loading and unloading, one panel per particle, measured and predicted.
@@ -168,8 +173,7 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
 
     Pages count from 1, with at most 20 particles each.
     """
-    count = len(calibration.campaign)
-    pages = -(-count // PAGE)
+    count, pages = len(calibration.campaign), pages_of(calibration)
     if page not in range(1, pages + 1):
         raise InputError(f"there is no page {page}; there are {pages}, counted from 1")
     chosen = range((page - 1) * PAGE, min(page * PAGE, count))

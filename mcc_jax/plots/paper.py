@@ -14,7 +14,7 @@ from ..calibrate.data import UNLOADED_FROM
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style
-from .curves import PAGE, plot_particles
+from .curves import pages_of, plot_particles
 
 _DOTTED: style.Look = {"color": style.GREY, "linewidth": 0.8, "dashes": (1, 1.5)}
 _DASHED: style.Look = {"dashes": (3.5, 1.8)}
@@ -35,7 +35,7 @@ def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
         (plot_curves, plot_collapse, plot_master, plot_law, plot_elastic, plot_residuals), calibration
     )
     figures["dimensions"] = plot_dimensions(calibration.campaign)
-    for page in range(1, -(-len(calibration.campaign) // PAGE) + 1):
+    for page in range(1, pages_of(calibration) + 1):
         figures["particles" if page == 1 else f"particles_{page}"] = plot_particles(calibration, page)
     return figures
 

@@ -233,8 +233,7 @@ def test_law_says_where_it_leaves_the_data(paper):
 
 @pytest.mark.extended
 def test_pages(paper, monkeypatch):
-    for module in ("curves", "paper"):
-        monkeypatch.setattr(f"mcc_jax.plots.{module}.PAGE", 12)
+    monkeypatch.setattr("mcc_jax.plots.curves.PAGE", 12)
     assert {"particles", "particles_2"} <= set(paper_figures(paper))
     second = plot_particles(paper, 2)
     assert len(panels(second)) == 8
