@@ -107,10 +107,17 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress
     spreads = priors.tau_C1, priors.tau_C3, priors.tau_C5, priors.modulus_scatter
     found = np.maximum([*np.asarray(p.tau), max(float(p.modulus_scatter), 1e-3)], 1e-4)
     x = [float(SpreadCoordinate(prior).coordinate(tau)) for prior, tau in zip(spreads, found.tolist(), strict=True)]
-    # Where a spread is zero its coordinate has no slope: begin a little above it.
-    hyper = np.concatenate([np.asarray(noise.logs), np.maximum(x, 0.3)])
-    state = State(replace(fit.point, theta=jnp.zeros((len(fit.tests), 0))), population)
-    scale, rms_um = np.asarray(noise.scale), root_mean_squares(fit.tests, fit.residual)
     return Base(
-        campaign, selection, model, fit.tests, scale, state, hyper, spreads, threshold_MPa, coarse, rms_um
-    )  # fmt: skip
+        campaign=campaign,
+        selection=selection,
+        model=model,
+        tests=fit.tests,
+        scale=np.asarray(noise.scale),
+        state=State(replace(fit.point, theta=jnp.zeros((len(fit.tests), 0))), population),
+        # Where a spread is zero its coordinate has no slope: begin a little above it.
+        hyperparameters=np.concatenate([np.asarray(noise.logs), np.maximum(x, 0.3)]),
+        spreads=spreads,
+        threshold_MPa=threshold_MPa,
+        coarse=coarse,
+        rms_um=root_mean_squares(fit.tests, fit.residual),
+    )

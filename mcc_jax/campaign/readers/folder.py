@@ -29,9 +29,8 @@ NO_DATA = frozenset(
 )
 """Endings of pictures, documents and settings, in which no instrument writes samples."""
 _READ_ME = re.compile(r"(read[-_ ]?me|licen[cs]e)(\..*)?", re.IGNORECASE)
-LONGEST_LIST = (
-    64  # longer ones (blocks of approach and drift) are not kept of many files: they would outgrow the curves
-)
+# Longer lists (blocks of approach and drift) are not kept of many files: they would outgrow the curves.
+LONGEST_LIST = 64
 _SHOWN = 6
 
 
