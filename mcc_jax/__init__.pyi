@@ -21,7 +21,6 @@ from .calibrate import compare as compare
 from .calibrate import fit as fit
 from .calibrate import least_squares as least_squares
 from .calibrate import load as load
-from .calibrate import log_evidence as log_evidence
 from .calibrate import predict_measured as predict_measured
 from .calibrate import predict_new_particle as predict_new_particle
 from .calibrate import sample as sample

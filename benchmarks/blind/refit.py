@@ -55,7 +55,7 @@ def judge(outcome: Outcome, formulas: dict[str, list[str]], evidence: Evidence) 
 
 
 def evidence_of(folder: Path, seed: int = 0) -> Evidence:
-    """Log evidences in one campaign, by `mcc_jax.log_evidence`; minus infinity where a formula cannot be fitted."""
+    """Log evidences in one campaign, by `mcc_jax.sample`; minus infinity where a formula cannot be fitted."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -65,7 +65,7 @@ def evidence_of(folder: Path, seed: int = 0) -> Evidence:
 
     def evidence(effects: Sequence[str]) -> float:
         try:
-            return float(mcc.log_evidence(campaign, mcc.Model().with_effects(*effects), seed=seed).value)
+            return mcc.sample(campaign, mcc.Model().with_effects(*effects), seed=seed).log_evidence[0]
         except mcc.InputError:
             return float("-inf")
 

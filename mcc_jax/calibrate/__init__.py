@@ -2,11 +2,10 @@
 
 from .campaigns import calibrate_many as calibrate_many
 from .campaigns import compare as compare
-from .campaigns import fit as fit
-from .campaigns import log_evidence as log_evidence
 from .curves import FittedCurve as FittedCurve
 from .data import select_tests as select_tests
 from .draws import Fit as Fit
+from .fitting import fit as fit
 from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
 from .numpyro_model import Model as Model

@@ -1,10 +1,9 @@
-"""Whole campaigns: the fit of one, models of one compared by evidence and held-out particles, many in a queue."""
+"""Models of one campaign compared by evidence and held-out particles, and many campaigns in a queue."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,67 +11,15 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from .._format import described
-from .._types import Progress
-from ..campaign import THRESHOLD_MPA, Campaign, check_tests
-from .compiling import one_blas_thread
-from .draws import Fit
-from .fitting import checked_settings, prepare
+from ..campaign import THRESHOLD_MPA, Campaign
 from .importance import smoothed
-from .judgement import numbers_in_reach
 from .least_squares import LeastSquares, least_squares
 from .numpyro_model import Model
 from .posterior import Posterior, sample
+from .running import one_blas_thread
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-@one_blas_thread
-def fit(
-    campaign: Campaign,
-    model: Model | None = None,
-    *,
-    threshold_MPa: float = THRESHOLD_MPA,
-    progress: Progress | None = None,
-) -> Fit:
-    """Fit particles, noise and population of a campaign: where samplers start, and in what coordinates.
-
-    For arguments and errors see `sample`.
-    """
-    campaign = check_tests(campaign)
-    progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
-    with numbers_in_reach(campaign):
-        return prepare(campaign, model, threshold_MPa, progress=progress)[1]
-
-
-# ---- models of one campaign ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """The log marginal likelihood of a model: of the tests under it, all its parameters integrated out."""
-
-    value: float  # natural logarithm
-    error: float  # its standard error; infinite where it is Laplace's approximation alone
-    pareto_k: float  # of the importance weights behind it; above 0.7 they are unreliable
-
-    __repr__ = described()
-
-
-def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, seed: int = 0) -> Evidence:
-    """The log marginal likelihood of a model, or of a posterior that was sampled.
-
-    Population and effects are integrated by importance sampling, particles by Laplace's approximation corrected with
-    the exact likelihood, the four parameters of the noise by Laplace's method around their mode.
-
-    Raises:
-        InputError: for a model with robust noise.
-    """
-    _refuse_robust(campaign if isinstance(campaign, Posterior) else model)
-    posterior = campaign if isinstance(campaign, Posterior) else sample(campaign, model, seed=seed)
-    k = np.inf if posterior.pareto_k_joint is None else posterior.pareto_k_joint
-    return Evidence(*posterior.log_evidence, float(k))
 
 
 def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: int = 0) -> pd.DataFrame:
@@ -91,8 +38,11 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
 
     if not models:
         raise InputError("there is no model to compare")
-    for one in models:
-        _refuse_robust(one)
+    if any((one.model if isinstance(one, Posterior) else one).robust for one in models):
+        raise InputError(
+            "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's",
+            remedy="Compare models with robust=False.",
+        )
     found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
     tests = [(one.particles, np.asarray(one.selection.tests.mask).sum(1).tolist()) for one in found]
     if any(one != tests[0] for one in tests):
@@ -117,15 +67,6 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     return pd.DataFrame(columns)
 
 
-def _refuse_robust(one: Model | Posterior | None) -> None:
-    model = one.model if isinstance(one, Posterior) else one
-    if model is not None and model.robust:
-        raise InputError(
-            "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's",
-            remedy="Compare models with robust=False.",
-        )
-
-
 def _chi2(one: Posterior, base: Posterior) -> float:
     """Mean square of residuals in standard deviations of the white noise of a base model."""
     variance: Any = np.asarray(base.fit.filters.solver.matrix.diag.d)
@@ -134,9 +75,6 @@ def _chi2(one: Posterior, base: Posterior) -> float:
     mask = np.asarray(base.selection.tests.mask)
     squares = np.asarray(one.fit.residual) ** 2 / np.where(mask, np.maximum(white, 1e-300), 1.0)
     return float(np.where(mask, squares, 0.0).sum() / mask.sum())
-
-
-# ---- many campaigns --------------------------------------------------------------------------------------------------
 
 
 @one_blas_thread
@@ -163,7 +101,6 @@ def calibrate_many(
     """
     methods: dict[str, Callable[..., Posterior | LeastSquares]] = {"bayes": sample, "least-squares": least_squares}
     calibrate = methods[arguments.choice(method, methods, "method")]
-    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     inspect.signature(calibrate).bind(None, threshold_MPa=threshold_MPa, progress=None, **settings)
     found: list[Posterior | LeastSquares | Exception] = []
     progress = progress or (lambda _, __: None)

@@ -18,10 +18,9 @@ from ..campaign import Campaign, Segment, campaign_segments, particle_batch
 from ..effects import AbstractEffect, Record, Variant
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .compiling import compiled
 from .data import MOST_POINTS, padded_length, records_of, row_kinds, rows_from_contact
 from .population import COEFFICIENTS
-from .sharding import Blocks
+from .running import Blocks, compiled
 
 KINDS = ("load", "hold", "unload", "reload")
 RIGID_MPA = 1e9  # where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined
@@ -39,11 +38,8 @@ def law_of(
     diameters_um: np.ndarray | None = None,
     variants: Variants | None = None,
 ) -> MccLaw:
-    """The law that a `calibration.json` describes, of the median particle or of one of these diameters [um].
-
-    Raises:
-        InputError: for a particle that took no part, or a parameter without a value.
-    """
+    """The law that a `calibration.json` describes, of the median particle or of one of these diameters [um]; raises
+    `InputError` for a particle that took no part, or a parameter without a value."""
     entry = None if particle is None else entry_of(content, particle)
     if entry is None:
         C = [math.exp(_number(content[f"log_{name}"]["mean"], f"log_{name}")) for name in COEFFICIENTS]
@@ -95,11 +91,7 @@ def _law(
 
 
 def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
-    """What the contents of a `calibration.json` say of one particle.
-
-    Raises:
-        InputError: if it is not there or took no part, naming those that did.
-    """
+    """What a `calibration.json` says of one particle; raises `InputError` if it is not there or took no part."""
     entries = {str(entry["particle"]): entry for entry in content["particles"]}
     if particle not in entries:
         raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {first_few(entries, 12)}.")
@@ -125,30 +117,20 @@ def _number(estimate: Mapping[str, Any], name: str) -> float:
 
 @dataclass(frozen=True)
 class FittedCurve:
-    """One particle's test from contact on, and what the law says of it; every array of shape (n,).
+    """One particle's test from contact on, and what the law says of it; every array of shape (n,)."""
 
-    Attributes:
-        name: of the particle.
-        why_not: why it took no part in the calibration; None if it did, or nobody asked.
-        time_s, force_mN, displacement_um: measured, raw.
-        kind: index into `KINDS`.
-        used: which points the calibration compared with the law.
-        own_um: displacement by the law with this particle's own coefficients and zero, the mean of the posterior's
-            predictions where there are some; NaN where there is none.
-        typical_um: with those of the population's middle.
-        low_um, high_um: central 95 % of what may be measured; NaN where there is no posterior.
-    """
-
-    name: str
-    why_not: str | None
-    time_s: np.ndarray
+    name: str  # of the particle
+    why_not: str | None  # why it took no part in the calibration; None if it did, or it was not calibrated
+    time_s: np.ndarray  # measured, raw, as the next two
     force_mN: np.ndarray
     displacement_um: np.ndarray
-    kind: np.ndarray
-    used: np.ndarray
+    kind: np.ndarray  # index into `KINDS`
+    used: np.ndarray  # which points the calibration compared with the law
+    # displacement by the law with this particle's own coefficients and zero, the mean of the posterior's predictions
+    # where there are some; NaN where there is none
     own_um: np.ndarray
-    typical_um: np.ndarray
-    low_um: np.ndarray
+    typical_um: np.ndarray  # with those of the population's middle
+    low_um: np.ndarray  # ends of the central 95 % of what may be measured; NaN where there is no posterior
     high_um: np.ndarray
 
     __repr__ = described()
@@ -178,11 +160,8 @@ def fitted_curves(
     predictions: Callable[[str], np.ndarray | None],
     variants: Variants | None = None,
 ) -> tuple[FittedCurve, ...]:
-    """The tests of a campaign with what its calibrated law predicts. Needs double precision, as calibration does.
-
-    `compared` are, by place, the rows of the curves of particles that took part, and which of them are compared;
-    `predictions` gives draws of what may be measured of a particle at its rows [um].
-    """
+    """The tests of a campaign with what its calibrated law predicts; `compared` and `predictions` are those of a
+    `Calibration`."""
     segments = campaign_segments(campaign)
     curves, rows = _measured(campaign, segments, compared)
     entry_by_name = {entry["particle"]: entry for entry in content["particles"]}

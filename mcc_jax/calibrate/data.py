@@ -206,10 +206,8 @@ def records_of(
     rows: Sequence[np.ndarray],
     longest: int,
 ) -> tuple[Record, np.ndarray, np.ndarray]:
-    """Records of the tests at some places of a campaign, at some rows of each, padded with the last to a length.
-
-    Forces and peaks are those of `turning_forces`; the arrays are its `reading` and `error`, shape (N, points).
-    """
+    """Records of the tests at some places of a campaign, at some rows of each, padded with the last to a length, with
+    the forces and peaks of `turning_forces`; and its `reading` and `error`, shape (N, points)."""
     humidity = humidities(campaign)
     found = []
     for i, some in zip(places, rows, strict=True):
@@ -236,11 +234,9 @@ class _Prepared:
 
 
 def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: int) -> np.ndarray:
-    """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always.
-
-    Of hundreds of cycles, whole unloadings and reloadings are left out of longer records, evenly; what they started
-    from stays, and so does the law's state, which knows the largest force only.
-    """
+    """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always. Of
+    hundreds of cycles some elastic parts are left out, but for the loading before them: the law knows the largest force
+    only."""
     start = contact_index(segments)
     rows = np.arange(start, len(curve))
     if len(rows) <= most_points:

@@ -16,7 +16,6 @@ from numpyro.infer.util import constrain_fn
 
 from .._format import table, with_sd
 from ..arguments import is_traced
-from .compiling import compiled
 from .data import Tests
 from .forward import Point
 from .importance import diagnostics, sample_weighted
@@ -27,6 +26,7 @@ from .numpyro_model import Model, coefficients
 from .particle_fit import ParticleFits
 from .particles import ExactLikelihood, Length, are_many, corrected, some_of, weighted
 from .population import COEFFICIENTS, Population
+from .running import compiled
 
 # Acceptance that NUTS aims at. Where spreads are small the density of the population parameters is narrow (a funnel),
 # and with fewer than some ten particles the usual 0.8 lets trajectories diverge there.
@@ -39,32 +39,19 @@ INDEPENDENT = {"divergences": 0, "leapfrogs": 0.0}  # of draws without a sampler
 
 
 class Fit(eqx.Module):
-    """Particles, noise and population of a campaign in agreement.
+    """Particles, noise and population of a campaign in agreement."""
 
-    Attributes:
-        model: what was assumed.
-        tests: the measurements.
-        individual: every particle on its own.
-        noise: the campaign's noise.
-        filters: its filters at the point.
-        point: most probable numbers of every particle.
-        residual: measured less predicted displacement there [um], 0 where masked.
-        marginal: the tests there, with every particle's own numbers integrated out.
-        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
-        converged: for particles, noise and population in turn.
-    """
-
-    model: Model = eqx.field(static=True)
-    tests: Tests
-    individual: ParticleFits
+    model: Model = eqx.field(static=True)  # what was assumed
+    tests: Tests  # the measurements
+    individual: ParticleFits  # every particle on its own
     noise: NoiseFit
-    filters: Whitening
-    point: Point
-    residual: Float[Array, "particles points"]
-    marginal: Marginal
-    mode: Float[Array, " d"]
-    covariance: Float[Array, "d d"]
-    converged: Bool[np.ndarray, " 3"]
+    filters: Whitening  # of the noise at the point
+    point: Point  # most probable numbers of every particle
+    residual: Float[Array, "particles points"]  # measured less predicted displacement there [um], 0 where masked
+    marginal: Marginal  # the tests there, with every particle's own numbers integrated out
+    mode: Float[Array, " d"]  # of the population in unbounded coordinates, in the order of `names`
+    covariance: Float[Array, "d d"]  # of the same
+    converged: Bool[np.ndarray, " 3"]  # for particles, noise and population in turn
 
     def __repr__(self) -> str:
         if is_traced(self.mode):

@@ -4,13 +4,14 @@ of the law's parameters that people see."""
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._format import plain, with_sd
-from .judgement import modulus_is_open
+from .judgement import MODULUS_OPEN
 from .numpyro_model import Model
 from .population import COEFFICIENTS
 
@@ -57,10 +58,7 @@ def exponential(one: Mapping[str, Any]) -> dict[str, Any]:
 
 def power_of_e(log: float) -> float:
     """The exponential, infinite where it overflows."""
-    try:
-        return math.exp(log)
-    except OverflowError:
-        return math.inf
+    return math.inf if log > math.log(sys.float_info.max) else math.exp(log)
 
 
 def effect_entries(model: Model, estimates: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -94,7 +92,8 @@ class Quantity(NamedTuple):
 def quantities(content: Mapping[str, Any]) -> Iterator[Quantity]:
     """The law's parameters in a `calibration.json`, or in the parameters before and after of a `discovery.json`."""
     yield Quantity("a", "shape parameter a", content["a"])
-    modulus = dict.fromkeys(content["a"]) if modulus_is_open(content) else content["effective_modulus_MPa"]
+    is_open = any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
+    modulus = dict.fromkeys(content["a"]) if is_open else content["effective_modulus_MPa"]
     yield Quantity("effective_modulus_MPa", "effective modulus", modulus, 1e-3, "GPa")
     if "modulus_at_peaks_MPa" in content:
         peaks = content["modulus_at_peaks_MPa"]

@@ -13,18 +13,18 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._errors import InputError
 from .._types import Progress
-from ..campaign import THRESHOLD_MPA, Campaign, other_material
+from ..campaign import THRESHOLD_MPA, Campaign, check_tests, other_material
 from ..campaign.signal import point_noise
-from .compiling import compiled, make_room
 from .data import MOST_POINTS, Selection, Tests, select
 from .draws import Fit, coordinates_of
-from .forward import Linear, Point, linearise
-from .linearisation import Linearisation
-from .marginal import Summaries, summarise
+from .forward import Linear, Linearisation, Point, linearise
+from .judgement import numbers_in_reach
+from .marginal import Marginal, summarise
 from .mode import LogPosterior, careful_enough, expect, log_densities, most_probable
 from .noise import (
     Noise,
     NoiseFit,
+    Whitening,
     estimate_noise,
     grams_and_likelihoods,
     particle_scales,
@@ -35,7 +35,7 @@ from .numpyro_model import Model
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .population import Population
 from .priors import Priors, SpreadCoordinate, check_prior_of_a, population_sites
-from .sharding import Blocks, require_same
+from .running import Blocks, compiled, make_room, one_blas_thread, require_same
 
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
 ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is allowed around the prior's centre
@@ -46,6 +46,22 @@ LEAST_GAIN = 0.005  # log density to gain below which effects are not linearised
 HALVINGS = 8  # most halvings of a step of a model with effects until it raises the density
 WIDEST = 1.0  # sd of the log of an effect's number over which the bend is taken; beyond, the exact likelihood corrects
 STUDENT_STEPS = 4  # how often weights of readings and noise are taken in turn, in each round
+
+
+@one_blas_thread
+def fit(
+    campaign: Campaign,
+    model: Model | None = None,
+    *,
+    threshold_MPa: float = THRESHOLD_MPA,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit particles, noise and population of a campaign: where samplers start, and in what coordinates. For arguments
+    and errors see `sample`."""
+    campaign = check_tests(campaign)
+    progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
+    with numbers_in_reach(campaign):
+        return prepare(campaign, model, threshold_MPa, progress=progress)[1]
 
 
 class Start(NamedTuple):
@@ -66,12 +82,8 @@ def prepare(
     progress: Progress = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit]:
-    """What was selected, and its fit: what every calibration begins with.
-
-    The model's priors become the campaign's own where they have to (`in_own_units`). Settings are those of `fit_tests`.
-    Raises `InputError` if no particle can be used, or processes were given different tests; call it within
-    `numbers_in_reach`.
-    """
+    """What was selected, and its fit, with settings of `fit_tests`; to be called within `numbers_in_reach`. Raises
+    `InputError` if no particle can be used, or processes were given different tests."""
     make_room()
     model, note = in_own_units(campaign, model)
     progress("selecting points")
@@ -104,10 +116,8 @@ def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
 
 
 class _Fitter:
-    """A fit under way: particles, noise and summaries at the current point, as attributes.
-
-    `weighted` are the tests with the weights of readings that inference takes.
-    """
+    """A fit under way: particles, noise and summaries at the current point, as attributes; `weighted` are the tests
+    with the weights of readings that inference takes."""
 
     def __init__(self, tests: Tests, model: Model, progress: Progress) -> None:
         if model.robust:
@@ -116,6 +126,7 @@ class _Fitter:
         self.tests = self.weighted = tests
         self.linearisation = Linearisation(tests, model.forms, model.scatter.positive, self.blocks)
         self.varying = [k for k, _ in model.scatter.varying]
+        self.zero_mean = np.asarray(tests.contact) + model.chosen_priors.zero_um.mean  # where zeros are expected [um]
 
     def begin_at(self, start: Start) -> dict[str, float]:
         """Particles and noise of another fit, and its values of the model's sites."""
@@ -146,7 +157,7 @@ class _Fitter:
 
     # ---- noise -------------------------------------------------------------------------------------------------------
 
-    def summaries(self, point: Point, linear: Linear) -> Summaries:
+    def summaries(self, point: Point, linear: Linear) -> tuple[Marginal, Whitening, Array]:
         """The tests at any point, summarised under the noise."""
         m, straight = self.model, self.linearisation.straight
         of_particles = point, straight, self.weighted, linear, self.noise.noise
@@ -236,11 +247,6 @@ class _Fitter:
         starts = np.stack([np.column_stack([*place, at.theta[:, self.varying]]) for place in places], 1)
         return self.particles(self.white, centre, width, at.theta, starts).point
 
-    @property
-    def zero_mean(self) -> np.ndarray:
-        """Where the zeros of displacement are expected [um]."""
-        return np.asarray(self.tests.contact) + self.model.chosen_priors.zero_um.mean
-
     def step(self, target: LogPosterior, before: Array, after: Array) -> Array:
         """A step of Gauss-Newton of population and particles, halved while the density, with the tests linearised where
         it ends, is lower than where it begins; where the population then is."""
@@ -249,7 +255,8 @@ class _Fitter:
             free = before + share * (after - before)
             point = self.together(target, free)
             linear = self.linearisation.at(point)
-            marginal = replace(self.summaries(point, linear).marginal, scatter=target.marginal.scatter)
+            marginal, *_ = self.summaries(point, linear)
+            marginal = replace(marginal, scatter=target.marginal.scatter)
             share /= 2
             if _density(free, LogPosterior.of(self.model, marginal)) > least or share < 0.5**HALVINGS:
                 self.point, self.linear = point, linear
@@ -381,11 +388,8 @@ def _start(latent: np.ndarray, flatness: np.ndarray, theta: np.ndarray, model: M
 
 
 def start_of_effects(point: Point, tests: Tests, noise: Noise, model: Model, blocks: Blocks) -> np.ndarray:
-    """Numbers of the effects to start from.
-
-    Of every formula the values of its grid are taken whose amplitude, to first order, explains most of the residuals
-    that particles' own numbers leave. The noise has to be a small one: what effects explain must not have gone into it.
-    """
+    """Numbers of the effects to start from: of every formula those of its grid whose amplitude, to first order,
+    explains most of what particles' own numbers leave. The noise must be small: without what effects explain."""
     forms, grids = model.forms, [v.grid() for v in model.effects]
     theta, best = np.zeros(len(forms.names)), np.full(len(grids), -1.0)
     for k in range(max(map(len, grids))):

@@ -55,12 +55,8 @@ class Weighted(NamedTuple):
 def sample_weighted(
     key: Array, mode: Array, covariance: Array, target: LogPosterior, *, chains: int, draws: int, many: bool = False
 ) -> Weighted:
-    """Draws of the population by importance resampling; of the first proposal alone if no weights are good enough.
-
-    A spread's coordinate may have either sign for the same spread: proposals and draws are folded to positive ones.
-    Each chain is resampled from its own proposals; of `many` particles no more is proposed than is kept, as a density
-    is expensive.
-    """
+    """Draws of the population by importance resampling, each chain from its own proposals; of the first proposal alone
+    if no weights are good enough. Of `many` particles, with an expensive density, no more is proposed than is kept."""
     from scipy.special import logsumexp
 
     kept = chains * draws
@@ -143,7 +139,8 @@ def _factor(covariance: np.ndarray) -> np.ndarray:
 
 
 class _Mixture:
-    """Draws of one Student distribution after another, all weighted by the mixture of them."""
+    """Draws of one Student distribution after another, all weighted by the mixture of them, and folded: a spread's
+    coordinate may have either sign for the same spread."""
 
     def __init__(self, seed: np.ndarray, target: LogPosterior) -> None:
         from scipy.stats import multivariate_t

@@ -45,10 +45,8 @@ UNKNOWN = 0.5
 
 
 def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray) -> Finding | None:
-    """The particles whose residual is unlike all others', both in micrometres and as a share of their range.
-
-    `rms_um` are root mean square residuals and `range_um` the ranges of displacement of all particles [um].
-    """
+    """The particles whose root mean square residual is unlike all others', both in micrometres and as a share of their
+    range of displacement [um]."""
     rms = np.asarray(rms_um, float)
     known = np.isfinite(rms) & (rms > 0) & (range_um > 0)
     if known.sum() < LEAST:
@@ -89,24 +87,14 @@ def is_unknown(modulus: Mapping[str, Any]) -> bool:
     return value is not None and sd is not None and sd >= UNKNOWN * abs(value)
 
 
-def modulus_is_open(content: Mapping[str, Any]) -> bool:
-    """Whether the tests leave the modulus open, from the findings of a `calibration.json`."""
-    return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
-
-
 def judged(
     campaign: Campaign,
     answer: Mapping[str, Any],
     outlying: Finding | None,
     again: Callable[[Campaign], Mapping[str, Any]] | None,
 ) -> tuple[Finding, ...]:
-    """All findings of a calibrated campaign, each with what the answer is without the particles that it names.
-
-    Args:
-        answer: a, modulus and their errors as in `calibration.json`, and whether it converged.
-        outlying: what `unlike_others` found.
-        again: calibrates a campaign and gives the same numbers; None to leave the answers without them out.
-    """
+    """All findings of a calibrated campaign, with what `unlike_others` found, each with what the answer is without
+    the particles that it names. `again` calibrates a campaign and returns its answer; None to leave these out."""
     modulus = answer["effective_modulus_MPa"]
     if not answer["converged"]:
         modulus = {**modulus, "interval_95": None}  # not to be believed, so not reported

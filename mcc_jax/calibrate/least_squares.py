@@ -16,7 +16,6 @@ from .._errors import InputError
 from .._format import described
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
-from .compiling import one_blas_thread
 from .data import Tests
 from .draws import Fit
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
@@ -28,7 +27,7 @@ from .pooled_fit import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
 from .population import COEFFICIENTS
 from .priors import SpreadCoordinate, nuisance_moments
 from .results import JointCalibration
-from .sharding import padded
+from .running import one_blas_thread, padded
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
 SHAPES = (0.0, 2.5)  # values of a that least squares begins from in addition to the population's mode; found by trial
@@ -56,21 +55,14 @@ class Identifiability:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class LeastSquares(JointCalibration):
-    """The joint least-squares fit of a campaign.
-
-    Attributes:
-        loss: the loss of the residuals.
-        settings: the pooled problem.
-        solution: its solution.
-        agreeing_starts: how many starts ended at the same optimum, of how many.
-    """
+    """The joint least-squares fit of a campaign."""
 
     method = "least-squares"
 
-    loss: Loss
-    settings: Pooled
+    loss: Loss  # of the residuals
+    settings: Pooled  # the pooled problem
     solution: Solution
-    agreeing_starts: tuple[int, int]
+    agreeing_starts: tuple[int, int]  # how many starts ended at the same optimum, of how many
 
     def failures(self) -> list[str]:
         """Why the fit must not be called converged; empty if every optimiser met its tolerances."""
@@ -191,15 +183,10 @@ class LeastSquares(JointCalibration):
         return tuple(map(np.asarray, self.solution.normal.covariance()))
 
     @property
-    def _shared_sd(self) -> np.ndarray:
-        """Standard deviations of the shared parameters."""
-        return np.sqrt(np.diagonal(self._covariance[2]))
-
-    @property
     def _reported_sd(self) -> np.ndarray:
-        """The same; NaN where the data leave a parameter open."""
+        """Standard deviations of the shared parameters; NaN where the data leave one open."""
         rows = self.identifiability.directions[self.identifiability.singular_values < OPEN]
-        return np.where(np.sum(rows**2, 0) > 0.1, np.nan, self._shared_sd)
+        return np.where(np.sum(rows**2, 0) > 0.1, np.nan, np.sqrt(np.diagonal(self._covariance[2])))
 
     @property
     def _alone(self) -> bool:
@@ -215,7 +202,8 @@ class LeastSquares(JointCalibration):
 
     def _effects(self) -> dict[str, Any]:
         """Estimates of the effects' numbers by the names of their sites."""
-        values, sds = np.asarray(self.solution.value.shared)[len(SHARED) :], self._shared_sd[len(SHARED) :]
+        values, variances = np.asarray(self.solution.value.shared), np.diagonal(self._covariance[2])
+        values, sds = values[len(SHARED) :], np.sqrt(variances[len(SHARED) :])
         size, found = len(self.model.effects), {}
         for k, name in enumerate(self.model.forms.names):
             log = k >= size and self.model.forms.positive[k - size]
@@ -246,14 +234,9 @@ def least_squares(
     likelihood and as the mode of their posterior.
 
     Args:
-        campaign: the tests.
-        model: form of unloading, what scatters, and priors for what the data leave open.
-        threshold_MPa: points below this stress on loading do not count [MPa].
+        campaign, model, threshold_MPa, without_flagged, progress: as in `sample`.
         loss: "linear", or a robust one of the whitened residuals, "soft_l1" or "cauchy".
         seed: kept for the record.
-        without_flagged: where single particles are flagged (a broken one, one unlike all others), calibrate again
-            without them and say what the answer is then.
-        progress: called with the name of each step.
 
     Raises:
         InputError: if no particle can be used.

@@ -26,12 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .compiling import compiled
 from .data import Tests
-from .forward import Linear, Point, snap
-from .linearisation import Straight, coordinates
+from .forward import Linear, Point, Straight, coordinates, snap
 from .noise import Along, Correlation, Noise, Whitening, whitening
 from .population import Population, Scatter, moments, particles_at
+from .running import compiled
 from .small_matrices import Cholesky, eliminate
 
 FARTHEST = 4.0  # exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test
@@ -41,7 +40,7 @@ MIN_SHARE = 0.05  # a coefficient of the polynomial is not drawn below this shar
 class Marginal(eqx.Module):
     r"""The tests around a point, zeros integrated out.
 
-    With u a particle's coordinates (kappa, the effects' parameters as in `linearisation`, and products of these, to the
+    With u a particle's coordinates (kappa, the effects' parameters as in `Straight`, and products of these, to the
     second order in effects), the log likelihood of a test is
 
     .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
@@ -214,14 +213,6 @@ def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"]
     return kappa, jnp.concatenate([jnp.exp(exponent), jnp.ones_like(away[..., 3:])], -1)
 
 
-class Summaries(NamedTuple):
-    """The tests summarised, their noise's filters, and the sd of white noise [um] that would weigh a test as much."""
-
-    marginal: Marginal
-    filters: Whitening
-    white: Float[Array, " particles"]
-
-
 @compiled
 def summarise(
     point: Point,
@@ -233,10 +224,12 @@ def summarise(
     scatter: Scatter,
     correlation: Correlation,
     along: Along,
-) -> Summaries:
+) -> tuple[Marginal, Whitening, Float[Array, " particles"]]:
     """Summarise all tests around a point by Gauss-Newton curvature, from the derivatives in the coordinates `straight`;
-    `zero_prior` is mean and sd of the zeros' distance from the recorded contact [um]."""
+    with the noise's filters, and the sd of white noise [um] that would weigh a test as much.
 
+    `zero_prior` is mean and sd of the zeros' distance from the recorded contact [um].
+    """
     whiten = jax.vmap(lambda scale, one, linear: whitening(noise, scale, one, linear, correlation, along))
     filters = whiten(noise.scale, tests, linear)
     ones = jnp.where(tests.mask, 1.0, 0.0)
@@ -262,15 +255,15 @@ def summarise(
     zero = point.zero + at, slopes, 1 / jnp.sqrt(total)
     marginal = Marginal(point, straight, left, log_scale, points - 1, *zero, tests.flatness, None, scatter)
     information = jax.vmap(lambda f: f.information)(filters)
-    return Summaries(marginal, filters, jnp.sqrt(points / jnp.maximum(information, 1e-30)))
+    return marginal, filters, jnp.sqrt(points / jnp.maximum(information, 1e-30))
 
 
 def _snap_evidence(latent, particle, force, used):
     """Evidence of a jump that no residual has: the curve's peak lies between the two forces around it.
 
-    The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point. A
-    normal distribution of the log of the force at the peak, as wide as the interval, takes its place: its derivative by
-    the latent vector, the distance of the interval's middle from it, and its precision, zero without a jump.
+    In place of a likelihood with a cliff, where the jump would move to another point, a normal distribution of the log
+    of the force at the peak, as wide as the interval: its derivative by the latent vector, the distance of the
+    interval's middle from it, and its precision, zero without a jump.
     """
     value, slope = jax.value_and_grad(snap)(latent, particle)
     at = jnp.where(jnp.isfinite(value), jnp.exp(jnp.where(jnp.isfinite(value), value, 0.0)), jnp.inf)

@@ -17,12 +17,11 @@ from jaxtyping import Array, Float, Int
 from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 
 from .._types import Scalar
-from .compiling import compiled, side_by_side
 from .marginal import Marginal, straighten
 from .noise import standard_promotion
 from .numpyro_model import Model
 from .population import Population
-from .sharding import padded
+from .running import compiled, padded, side_by_side
 
 handlers: Any = numpyro.handlers
 
@@ -41,10 +40,9 @@ def seeded(model: Any) -> Any:
 
 
 class Shapes(eqx.Module):
-    """Flatness and weights of the particles: what the priors of the population need where there is no `Marginal`."""
+    """Flatness of the particles: what the priors of the population need where there is no `Marginal`."""
 
     flatness: Float[Array, " particles"]
-    weight: Float[Array, " particles"] | None = None
 
 
 @cache
@@ -193,10 +191,8 @@ def log_densities(free: np.ndarray, target: LogPosterior) -> np.ndarray:
 def most_probable(
     start: Float[Array, " d"], target: LogPosterior
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
-    """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
-
-    Newton's method in a trust region, scaled by the curvature at the start; without one the covariance is not a number.
-    """
+    """Mode of the population in unbounded coordinates by Newton's method in a trust region, covariance there (NaN where
+    the start has no curvature), and whether the optimiser converged."""
     origin = np.asarray(start)
     width = np.full(len(origin), 1e-5)
     value, slope, curvature = expanded(origin, width, target)

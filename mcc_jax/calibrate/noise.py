@@ -28,10 +28,10 @@ from tinygp.noise import Diagonal
 from tinygp.solvers.quasisep.solver import QuasisepSolver
 
 from .._types import Path, Scalar
-from .compiling import compiled
 from .data import READING_UM, Tests
 from .forward import Linear
 from .priors import NoisePrior
+from .running import compiled
 from .small_matrices import eliminate
 
 
@@ -74,14 +74,12 @@ class Noise(eqx.Module):
     @classmethod
     def of(cls, numbers: Sequence[float] | np.ndarray, scale: Float[Array, " particles"]) -> Noise:
         """From the four numbers, outside compiled functions."""
-        displacement, force, correlated, length = (jnp.asarray(np.asarray(v, float)) for v in numbers)
-        return cls(displacement, force, correlated, length, scale)
+        return cls(*(jnp.asarray(np.asarray(v, float)) for v in numbers), scale=scale)
 
     @classmethod
     def from_logs(cls, logs: Float[Array, " 4"], scale: Float[Array, " particles"]) -> Noise:
         """From the logarithms of the four numbers."""
-        displacement, force, correlated, length = jnp.exp(logs)
-        return cls(displacement, force, correlated, length, scale)
+        return cls(*jnp.exp(logs), scale=scale)
 
 
 # Variance of a point that does not count [um^2]: beyond any reading, and far from where doubles lose digits.
@@ -166,10 +164,8 @@ _TRACING = threading.RLock()
 
 @contextmanager
 def standard_promotion() -> Iterator[None]:
-    """NumPyro and tinygp count on JAX's usual promotion of types and ranks, whatever the caller's settings are.
-
-    And NumPyro keeps the handlers in force in one list for all threads: a model is traced by one thread at a time.
-    """
+    """JAX's usual promotion of types and ranks, on which NumPyro and tinygp count; for one thread at a time, since
+    NumPyro keeps its handlers in one list for all of them."""
     with _TRACING, jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
@@ -177,11 +173,8 @@ def standard_promotion() -> Iterator[None]:
 def forward_substitution(
     solver: QuasisepSolver, values: Float[Array, "steps columns"]
 ) -> Float[Array, "steps columns"]:
-    """Solve the factor's lower triangular system by forward substitution.
-
-    The same as tinygp's `solve_triangular`, at half its time on a CPU: its products of tiny matrices are calls of a
-    library at every step; as sums they are part of the loop.
-    """
+    """The factor's lower triangular system solved, in half the time of tinygp's `solve_triangular` on a CPU: its
+    products of tiny matrices are calls of a library at every step; as sums they are part of the loop."""
     (diagonal,), (left, right, transition) = solver.factor
 
     def step(state: Array, at: tuple[Array, ...]) -> tuple[Array, Array]:
@@ -196,10 +189,8 @@ def forward_substitution(
 def whitening(
     noise: Noise, scale: Scalar, tests: Tests, linear: Linear, correlation: Correlation, along: Along
 ) -> Whitening:
-    """The factored covariance of one test.
-
-    The scale is this particle's, and `noise.scale` is not used; tests and linear are without an axis of particles.
-    """
+    """The factored covariance of one test: tests and linear have no axis of particles, and the scale is this particle's
+    in place of `noise.scale`."""
     variance = jnp.where(tests.mask, scale**2 * _read_out(noise, tests, linear), MASKED_UM2)
     place = tests.path if along is Along.LOAD else tests.record.time
     with standard_promotion():
@@ -266,10 +257,7 @@ def grams_and_likelihoods(
     along: Along,
 ) -> tuple[Float[Array, "particles many q q"], Float[Array, "particles many"]]:
     """Gram matrix of each test's effects and residual under each of many noises, and log likelihood without effects.
-
-    The particle's b1, b3, b5, e and zero are integrated out, with standard deviations of 1 and `zero_sd`: wide, and
-    enough to keep directions without data in place.
-    """
+    The particle's b1, b3, b5, e and zero are integrated out, with wide standard deviations, 1 and `zero_sd`."""
 
     def of_each(logs: Array) -> tuple[Array, Array]:
         noise = Noise.from_logs(logs, scale)
@@ -309,14 +297,12 @@ class NoiseFit(eqx.Module):
 def estimate_noise(
     log_likelihoods: Callable[[Array], Array], prior: NoisePrior, start: Noise, *, uncertainty: bool = True
 ) -> NoiseFit:
-    """Noise by restricted maximum likelihood with its prior, the particles' scales as they are (`particle_scales`).
-
-    `log_likelihoods` are those of each particle under many logarithms of the four numbers, shape (particles, many):
-    derivatives are cheaper as differences, all of them in one batch, than to compile.
-    """
+    """Noise by restricted maximum likelihood with its prior and the scales at the start, from log likelihoods of each
+    particle under many logarithms of the four numbers, shape (particles, many)."""
     from scipy.optimize import minimize
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        # Differences, all of them in one batch, are cheaper than derivatives to compile.
         at = logs + STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
         # Summed here, in one order, however the particles are spread.
         values = -(np.sum(np.asarray(log_likelihoods(jnp.asarray(at))), axis=0) + prior.log_density(at))

@@ -76,9 +76,8 @@ class Model:
     ) -> None:
         chosen = tuple(_variant(one) for one in _several(effects))
         names = [v.mechanism for v in chosen]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"{name} appears twice in one model", remedy="Take one formula of each mechanism.")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"{twice[0]} appears twice in one model", remedy="Take one formula of each mechanism.")
         differ = tuple(dict.fromkeys([*_several(varying), *(v.mechanism for v in chosen if v.random_per_test)]))
         for name in differ:
             arguments.choice(name, names, "effect to vary")
@@ -258,7 +257,6 @@ class RecordNoise(dist.Distribution):
     def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
         """Draws; points that do not count are NaN."""
         count, points = self.loc.shape
-
         colour = eqx.filter_vmap(lambda f, *normal: f.colour(*normal))
 
         def one(key: Any) -> Array:

@@ -31,25 +31,11 @@ from ..campaign.adjustment import refusal
 from ..campaign.signal import point_noise
 from ..geometry import plastic_shape_factor
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
+from . import paper_steps as steps
 from .curves import RIGID_MPA, responses_um
 from .data import MOST_POINTS, row_kinds, rows_from_contact
 from .estimates import NO_SAMPLER, estimate, finite
 from .judgement import numbers_in_reach
-from .paper_steps import (
-    ElasticFit,
-    MasterCurve,
-    Objective,
-    PlasticFit,
-    ShapeFit,
-    StrainTable,
-    campaign_branches,
-    fit_effective_modulus,
-    fit_polynomial,
-    fit_population,
-    fit_shape_parameter,
-    master_curve,
-    strain_table,
-)
 from .population import COEFFICIENTS
 from .results import Calibration
 
@@ -113,13 +99,13 @@ class PaperCalibration(Calibration):
     method = "paper"
 
     adjustment: Adjustment
-    table: StrainTable
-    shape: ShapeFit
-    shape_reference: ShapeFit | None
-    objective: Objective
-    master: MasterCurve
-    plastic: PlasticFit
-    elastic: ElasticFit
+    table: steps.StrainTable
+    shape: steps.ShapeFit
+    shape_reference: steps.ShapeFit | None
+    objective: steps.Objective
+    master: steps.MasterCurve
+    plastic: steps.PlasticFit
+    elastic: steps.ElasticFit
     mean_law: MccLaw
     particles: tuple[ParticleFit | None, ...]
     displacement_noise_um: float
@@ -140,7 +126,7 @@ class PaperCalibration(Calibration):
         return float(self.mean_law.a)
 
     @property
-    def chosen_shape(self) -> ShapeFit:
+    def chosen_shape(self) -> steps.ShapeFit:
         """The fit whose `a` is in the law."""
         return self.shape if self.objective == "full" or self.shape_reference is None else self.shape_reference
 
@@ -244,7 +230,7 @@ def calibrate_paper(
     campaign: Campaign,
     *,
     threshold_MPa: float = THRESHOLD_MPA,
-    objective: Objective = "full",
+    objective: steps.Objective = "full",
     reference: str | None = None,
     unloading: Unloading | str = Unloading.PRINTED,
     strain_scaling: StrainScaling | str = StrainScaling.RAW,
@@ -262,16 +248,14 @@ def calibrate_paper(
         unloading: form of unloading that the modulus belongs to.
         strain_scaling: how the shape factor enters unloading.
         seed: kept for the record.
-        without_flagged: where single particles are flagged (a broken one, one unlike all others), calibrate again
-            without them and say what the answer is then.
-        progress: called with the name of each step.
+        without_flagged, progress: as in `sample`.
 
     Raises:
         InputError: if no two particles can be used, or the reference particle is unknown or unusable.
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
-    arguments.choice(objective, get_args(Objective), "objective")
+    arguments.choice(objective, get_args(steps.Objective), "objective")
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
     seed = arguments.seed(seed)
@@ -288,17 +272,18 @@ def calibrate_paper(
             )
         raise refusal(campaign, problem, adjustment.reasons)
     with numbers_in_reach(campaign):
-        table = strain_table(adjustment, campaign.diameters_um)
+        table = steps.strain_table(adjustment, campaign.diameters_um)
         progress("fitting the shape parameter")
-        shape = fit_shape_parameter(table)
+        shape = steps.fit_shape_parameter(table)
         shape_reference = _reference_fit(campaign, table, objective, reference)
         chosen = shape_reference if objective == "reference" and shape_reference is not None else shape
         progress("fitting the plastic coefficients")
-        master = master_curve(table, chosen.a)
-        plastic = fit_population(master, adjustment.threshold_MPa)
+        master = steps.master_curve(table, chosen.a)
+        plastic = steps.fit_population(master, adjustment.threshold_MPa)
         progress("fitting the effective modulus")
         eta = of_each_particle(campaign.diameters_um, lambda p: plastic_shape_factor(p, chosen.a))
-        elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
+        branches = steps.campaign_branches(campaign, adjustment)
+        elastic = steps.fit_effective_modulus(branches, eta, unloading, strain_scaling)
         modulus = RIGID_MPA if elastic.effective_modulus_MPa is None else elastic.effective_modulus_MPa
         law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
         progress("predicting every particle")
@@ -320,21 +305,18 @@ def calibrate_paper(
         seed=seed,
     )
 
+    settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "objective": objective}
+    settings |= {"unloading": unloading, "strain_scaling": strain_scaling, "without_flagged": False}
+
     def again(some: Campaign) -> PaperCalibration:
-        return calibrate_paper(
-            some,
-            threshold_MPa=threshold_MPa,
-            objective=objective,
-            reference=reference if reference in some.particles else None,
-            unloading=unloading,
-            strain_scaling=strain_scaling,
-            without_flagged=False,
-        )
+        return calibrate_paper(some, reference=reference if reference in some.particles else None, **settings)
 
     return calibration.judged(started, again if without_flagged else None)
 
 
-def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective, name: str | None) -> ShapeFit | None:
+def _reference_fit(
+    campaign: Campaign, table: steps.StrainTable, objective: steps.Objective, name: str | None
+) -> steps.ShapeFit | None:
     """`a` by the objective with a reference particle; of two particles only if that was asked for."""
     if name is None and objective == "full" and len(table.index) < 3:
         return None
@@ -345,16 +327,14 @@ def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective,
             file=campaign.source or None,
             remedy="Name another one, or leave the choice to the paper's rule.",
         )
-    return fit_shape_parameter(table, "reference", index)
+    return steps.fit_shape_parameter(table, "reference", index)
 
 
 def predict_particles(
     campaign: Campaign, adjustment: Adjustment, law: MccLaw, eta: np.ndarray
 ) -> tuple[ParticleFit | None, ...]:
-    """Every kept particle's displacement under its measured force, by the mean law and by its own coefficients.
-
-    `eta` are the shape factors of all particles, shape (N,). One entry per particle, None where it was not kept.
-    """
+    """Every particle's displacement under its measured force by the mean law and by its own coefficients, None where it
+    was not kept; `eta` are the shape factors of all, shape (N,)."""
     kept = np.flatnonzero(adjustment.kept).tolist()
     factors = []
     for i in kept:
@@ -362,7 +342,7 @@ def predict_particles(
         assert curve is not None
         # Residuals are relative: below a fiftieth of the peak they would be those of the force read-out.
         use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
-        factors.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use])[0])
+        factors.append(steps.fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use])[0])
     C = np.array(factors) ** (1 / np.array([1, 3, 5]))
     mean = jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, len(kept))), law)
     own = eqx.tree_at(lambda one: one.plastic, mean, eqx.filter_vmap(Plastic)(*jnp.asarray(C.T)))

@@ -47,10 +47,8 @@ class StrainTable:
 
 
 def strain_table(adjustment: Adjustment, diameters_um: np.ndarray) -> StrainTable:
-    """Tabulate the kept loading curves by linear interpolation, on a grid of `GRID_POINTS` stresses.
-
-    `diameters_um` are D1, D2, D3 [um] of all particles, shape (N, 3).
-    """
+    """Tabulate the kept loading curves by linear interpolation on `GRID_POINTS` stresses; `diameters_um` are D1, D2, D3
+    [um] of all particles, shape (N, 3)."""
     diameters_um = arguments.diameters(diameters_um)
     index = np.flatnonzero(adjustment.kept)
     curves = [c for c in adjustment.curves if c is not None and c.stress_max_MPa > adjustment.threshold_MPa]
@@ -335,10 +333,8 @@ class ElasticFit:
 
 
 def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[ElasticBranch]:
-    """The elastic branches of every particle that the offset step kept, in its adjusted strain.
-
-    They consist of the points between `UNLOADED_FROM` and the peak, of which a branch has five at least.
-    """
+    """The elastic branches of every particle that the offset step kept, in its adjusted strain: five points at least
+    between `UNLOADED_FROM` and the peak."""
     found = []
     for i in np.flatnonzero(adjustment.kept).tolist():
         curve, segments = campaign.curves[i], adjustment.segments[i]

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, derivatives, snap
+from .running import compiled
 
 # Found by trial on simulated campaigns.
 ZEROS, ZERO_REACH = 21, 0.04  # zeros of displacement that are tried, within this share of the effective diameter
@@ -34,11 +34,8 @@ class ParticleFits(eqx.Module):
 
 
 def linear_start(stress: np.ndarray, strain: np.ndarray) -> tuple[np.ndarray, float]:
-    """Coefficients (as b) of one particle and the strain at its zero, from its loading, without iteration.
-
-    Stress is linear in the three coefficients at a given zero, so zeros are tried on a grid; deviations of stress are
-    divided by the slope, which makes them deviations of strain.
-    """
+    """Coefficients (as b) of one particle and the strain at its zero, from its loading. At a given zero stress is
+    linear in them, so zeros are tried on a grid. Deviations of stress over the slope are deviations of strain."""
     top, shifts = np.max(stress, initial=0.0), np.linspace(-ZERO_REACH, ZERO_REACH, ZEROS)
     x = strain - shifts[:, None]
     possible, x = (x > 1e-4).all(1), np.maximum(x, 1e-4)
@@ -82,9 +79,6 @@ def fit_particles(
     varying: tuple[int, ...] = (), block: int = 0,
 ) -> ParticleFits:  # fmt: skip
     """Fit every particle by itself, its modulus included, from several starts, by Levenberg's and Marquardt's method.
-
-    The law is linearised by the programs that every other fit uses, so many particles at a time as a block has; a start
-    that has converged takes no further part.
 
     Args:
         noise: scale of each particle's residuals [um].

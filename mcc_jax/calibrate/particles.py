@@ -21,14 +21,13 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from .._blocks import even_size
 from .._types import Scalar
-from .compiling import compiled, side_by_side
 from .data import Tests
 from .forward import Forms, Point, residuals
 from .importance import MOST_PARETO_K, ordered_resample, pareto_k, relative_scatter, smoothed_weights
 from .marginal import Marginal, ParticleDraw
 from .noise import Whitening
 from .population import Population
-from .sharding import Blocks
+from .running import Blocks, compiled, side_by_side
 
 # Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `bench_scale.py`).
 # A particle whose weight scatters by more than this share of its mean gets several candidates per draw; of many
@@ -93,11 +92,11 @@ def draw_particles(
     candidates: int = 1,
     common: bool | Bool[Array, ""] = False,
 ) -> ParticleDraws:
-    """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
+    """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood: results
+    have the particles first, then the draws.
 
     One is chosen of so many `candidates`; with 0 of them one is drawn and not compared. `keys` are the data of one
-    random key, for every particle; `common` random numbers are the same for every draw of the population. Results have
-    the particles first, then the draws.
+    random key, for every particle; `common` random numbers are the same for every draw of the population.
     """
     draws, count, size = population.a.shape[0], len(exact.tests), exact.marginal.scatter.size
 
@@ -170,11 +169,8 @@ def some_of(population: Population, rows: slice | np.ndarray) -> Population:
 
 
 class Drawer:
-    """Draws of the particles, in blocks of so many, as arrays of NumPy with the axes (draw, particle).
-
-    `chunk` draws of the population are worked on in one call, so that one compilation serves any number of them; all
-    by default. Chunks run next to each other in a single process.
-    """
+    """Draws of the particles, in blocks of so many, as arrays of NumPy with the axes (draw, particle); `chunk` draws of
+    the population, or all, in one call, so that one compilation serves any number of them."""
 
     def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:
         self.count = len(exact.tests)
@@ -323,12 +319,8 @@ def evenly(count: int, some: int) -> np.ndarray:
 
 def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> tuple[np.ndarray, float]:
     """What the exact likelihood adds to the log density of the population at every draw, up to a constant, by
-    regression on the population's parameters; and the standard error of its slope in standard deviations of the
-    posterior.
-
-    `total` gives the sums of log ratios at rows of `draws`, shape (draws, parameters), with one of two sets of random
-    numbers.
-    """
+    regression of a `total` of log ratios (at rows of the draws, with one of two sets of random numbers) on its
+    parameters; and the standard error of the slope in standard deviations of the posterior."""
     rows = evenly(len(draws), PROBES)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)
     # Uncorrelated and of standard deviation 1, so that a slope is the shift of a mean in standard deviations.

@@ -23,11 +23,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from .._types import Values
-from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, residuals
 from .noise import Whitening
 from .population import Population, Scatter, moments
+from .running import compiled
 from .small_matrices import Cholesky
 
 
@@ -79,10 +79,7 @@ def _damped(A: Float[Array, "*batch p p"], damping: Any) -> Float[Array, "*batch
 
 
 def normal_equations(push: Callable[[Parameters], Any], residual: Any, y: Parameters) -> Normal:
-    """Assemble the normal equations from a linearised residual.
-
-    `push` is the directional derivative of the residual; every leaf of it has the particles as its first axis.
-    """
+    """The normal equations of a residual with the directional derivative `push`; leaves have the particles first."""
     count, P = y.local.shape
 
     def flat(tree: Any) -> Float[Array, "particles residuals"]:

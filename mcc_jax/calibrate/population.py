@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from .linearisation import Places
+from .forward import Places
 
 COEFFICIENTS = ("C1", "C3", "C5")
 

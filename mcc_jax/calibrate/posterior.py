@@ -15,7 +15,6 @@ from .._format import first_few
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, check_plausibility, check_tests
 from ..campaign.findings import worst
-from .compiling import imported_meanwhile, one_blas_thread
 from .draws import Fit, draw_fast, draw_joint, effect_numbers
 from .estimates import effect_entries, finite, summary
 from .fitting import Start, checked_settings, prepare
@@ -26,7 +25,7 @@ from .particles import Length
 from .population import COEFFICIENTS
 from .predict import data_tree, predict_measured
 from .results import PosteriorDraws
-from .sharding import block_size
+from .running import block_size, imported_meanwhile, one_blas_thread
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -54,7 +53,8 @@ class Posterior(PosteriorDraws):
         divergences, leapfrogs: of NUTS, divergent trajectories and mean steps of a draw; 0 of independent draws.
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
         log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
-            approximation alone).
+            approximation alone). Population and effects are integrated by importance sampling, particles by Laplace's
+            approximation corrected with the exact likelihood, the noise by Laplace's method around its mode.
     """
 
     method = "bayes"
@@ -76,17 +76,17 @@ class Posterior(PosteriorDraws):
     def failures(self) -> list[str]:
         """Why the result must not be called converged, and what to do; empty if all gates are passed."""
         parts = zip(("noise", "population"), self.fit.converged[1:], strict=True)
-        unfitted = [part for part, fine in parts if not fine]
+        unfitted = " and ".join(part for part, fine in parts if not fine)
         if unfitted and self.mode == "fast":  # diagnostics of draws around a fit that is none mean nothing
-            by, what = self._missed, " and ".join(unfitted)
             if self.at_noise_level():
                 return [
-                    f"the search for the {what} did not come to rest, although the law misses these tests by no more "
-                    f"than noise, {by}: they leave numbers of the model open; narrow the priors, or leave out an effect"
+                    f"the search for the {unfitted} did not come to rest, although the law misses these tests by no "
+                    f"more than noise, {self._missed}: they leave numbers of the model open; narrow the priors, or "
+                    "leave out an effect"
                 ]
             return [
-                f"no {what} was found that fits these tests: the law misses them by {by}; look at the curves, leave "
-                "out the particles that are unlike the others, or look for what is missing (discover)"
+                f"no {unfitted} was found that fits these tests: the law misses them by {self._missed}; look at the "
+                "curves, leave out the particles that are unlike the others, or look for what is missing (discover)"
             ]
         found = []
         slowest, rhat = max(self.rhat.items(), key=lambda item: item[1])
@@ -258,8 +258,8 @@ def sample(
     progress, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     arguments.choice(mode, get_args(Mode), "mode")
-    chains, draws = (arguments.whole(n, name, least=1) for n, name in ((chains, "chains"), (draws, "draws")))
-    length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
+    counts = {"chains": chains, "warmup": warmup, "draws": draws}
+    length = Length(*(arguments.whole(count, name, least=1) for name, count in counts.items()))
     fast = mode == "fast"
     with numbers_in_reach(campaign):
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start

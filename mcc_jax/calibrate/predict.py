@@ -18,7 +18,6 @@ from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PAR
 from ..effects import Record
 from ..geometry import Particle
 from ..law import MccLaw, Plastic
-from .compiling import compiled
 from .draws import coordinates_of, named_population
 from .estimates import summary
 from .noise import Whitening
@@ -26,6 +25,7 @@ from .numpyro_model import Model
 from .population import COEFFICIENTS, Population, flattened
 from .priors import population_sites
 from .results import PosteriorDraws
+from .running import compiled
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -163,8 +163,7 @@ def predict_new_particle(
     """
     sizes = arguments.one_particle(diameters_um)
     force = np.asarray(arguments.path(force_mN, "force_mN"), float)
-    if not np.isfinite(force).all():
-        raise InputError(f"force_mN is {force[~np.isfinite(force)][0]} at one point", remedy="Leave it out.")
+    arguments.finite(force, "force_mN")
     time = np.zeros(len(force)) if time_s is None else np.asarray(arguments.path(time_s, "time_s"))
     arguments.same_length(force_mN=force, time_s=time)
     laws = sample_laws(calibration, count, seed=seed)
@@ -248,13 +247,6 @@ def data_tree(c: Any, seed: int) -> DataTree:
     posterior |= {f"particle_{name}": c.theta[..., k] for name, k in varying.items()}
     known = coordinates_of(flattened(c.population), c.model)
     sites = population_sites(c.model, np.asarray(c.fit.tests.flatness), known)
-    constant = {
-        "force_mN": np.asarray(tests.force),
-        "diameters_um": c.campaign.diameters_um[list(c.selection.kept)],
-        "mask": mask,
-        "points": mask.sum(1),
-        "pareto_k": c.pareto_k,
-    }
     groups = {
         "posterior": posterior,
         "log_likelihood": {"test": c.log_likelihood},
@@ -262,7 +254,13 @@ def data_tree(c: Any, seed: int) -> DataTree:
         "sample_stats": {"lp_test": c.log_likelihood.sum(-1)},
         "prior": prior,
         "observed_data": {"displacement_um": np.where(mask, np.asarray(tests.displacement), np.nan)},
-        "constant_data": constant,
+        "constant_data": {
+            "force_mN": np.asarray(tests.force),
+            "diameters_um": c.campaign.diameters_um[list(c.selection.kept)],
+            "mask": mask,
+            "points": mask.sum(1),
+            "pareto_k": c.pareto_k,
+        },
     }
     dims = {name: dimensions for name, (_, dimensions) in VARIABLES.items() if dimensions}
     dims |= {f"particle_{name}": ["particle"] for name in varying}

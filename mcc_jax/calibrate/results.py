@@ -47,19 +47,13 @@ class Saved:
         return self.content
 
     def save(self, folder: str | Path) -> None:
-        """Write the JSON and what `mcc_jax.load` reads into a folder: both or nothing.
-
-        Raises:
-            InputError: if the folder cannot be written, or a part cannot be read back.
-        """
+        """Write the JSON and what `mcc_jax.load` reads into a folder: both, or `InputError` and nothing."""
         with results(arguments.file_path(folder, "folder")) as stage:
             self.write(stage.folder)
 
     def write(self, folder: Path, **more: Any) -> dict[str, Any]:
-        """Write the files of `save` into an existing folder that appears as a whole; returns the contents of the JSON.
-
-        `more` are further entries of the JSON, such as provenance.
-        """
+        """Write the files of `save` into an existing folder that appears as a whole; returns the contents of the JSON,
+        which has `more` entries, such as provenance."""
         content = self.to_json() | more
         (folder / self.content_file).write_text(json_text(content), encoding="utf-8")
         (folder / self.archive_file).write_bytes(encode(self))
@@ -165,10 +159,8 @@ class Calibration(Saved):
         raise NotImplementedError
 
     def judged(self, started: float, again: Callable[[Campaign], Calibration] | None) -> Any:
-        """The same with findings, see `judgement.judged`, and the time it took since it was started.
-
-        `again` calibrates the campaign without the particles that are flagged; None to report no answers without them.
-        """
+        """The same with findings, see `judgement.judged`, and the time it took since it was started; `again` calibrates
+        a campaign."""
         answer_without = None if again is None else lambda some: again(some).answer()
         findings = judged(self.campaign, self.answer(), unlike_others(*self._own_residuals()), answer_without)
         return replace(self, findings=findings, runtime_s=time.perf_counter() - started)
@@ -272,10 +264,8 @@ class JointCalibration(Calibration):
 
     @property
     def noise_share(self) -> float:
-        """Share of the residual variance that the fit attributes to correlated noise [-].
-
-        Read-out and force noise is white: what is correlated along a test and no smaller is rather what the law misses.
-        """
+        """Share of the residual variance that the fit attributes to correlated noise [-]: noise of read-out and force
+        is white, so a large share is rather what the law misses."""
         variance, correlated = self._variances()
         return float(np.median(correlated / variance))
 
@@ -366,9 +356,7 @@ def load(folder: str | Path) -> Any:
     """
     path = arguments.file_path(folder, "folder")
     if path.is_file():
-        if path.name in (DISCOVERY_ARCHIVE, ARCHIVE):
-            return read_saved(path)
-        raise InputError("is a file, and not one that a result is read from", file=path, remedy=A_FOLDER)
+        return read_saved(path)
     if not path.is_dir():
         raise InputError("there is no such folder", file=path, remedy=A_FOLDER)
     there = {entry.name for entry in path.iterdir()}

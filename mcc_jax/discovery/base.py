@@ -20,7 +20,7 @@ from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.numpyro_model import Model
 from ..calibrate.particle_fit import snaps
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
-from ..calibrate.sharding import Blocks
+from ..calibrate.running import Blocks
 from ..campaign import Campaign, find_segments
 from .settings import DECISIONS
 

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, linearise
 from ..calibrate.noise import Along, Correlation, Noise, whitening
 from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import nuisance_moments
+from ..calibrate.running import compiled
 from ..effects import Variant
 from .base import Base, State
 

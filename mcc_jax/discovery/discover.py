@@ -14,10 +14,10 @@ from .. import arguments
 from .._errors import InputError
 from .._types import Progress
 from ..calibrate import Model, sample
-from ..calibrate.compiling import one_blas_thread
 from ..calibrate.data import ranges_um, root_mean_squares
 from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import LEAST_LEFT, numbers_in_reach, unlike_others
+from ..calibrate.running import one_blas_thread
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import named
 from ..campaign.force_zero import open_zero

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, Point
+from ..calibrate.running import compiled_quickly
 from ..effects import Variant
 from ..effects.record import RELOAD, UNLOAD
 from .settings import WAVES

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array
 from scipy.special import log_ndtr, logsumexp
 
-from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Point
 from ..calibrate.priors import SCALES
+from ..calibrate.running import compiled_quickly
 from ..effects import AbstractEffect, Mechanism, Need, Nuisance, Variant
 from ..law import PUNCH_AREA, signatures
 from .base import Base, State

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from .._types import Progress
-from ..calibrate.compiling import side_by_side
 from ..calibrate.numpyro_model import Model
+from ..calibrate.running import side_by_side
 from ..campaign import Finding
 from ..effects import Mechanism, Variant
 from .base import Base

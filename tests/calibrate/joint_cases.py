@@ -6,8 +6,7 @@ import numpy as np
 
 from mcc_jax import Instrument, Plastic, Programme, Unloading, simulate_campaign
 from mcc_jax.calibrate.data import Tests, select_tests
-from mcc_jax.calibrate.forward import Linear
-from mcc_jax.calibrate.linearisation import Straight
+from mcc_jax.calibrate.forward import Linear, Straight
 from mcc_jax.calibrate.marginal import Marginal
 from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.calibrate.population import Population

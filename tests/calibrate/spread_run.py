@@ -17,8 +17,7 @@ def blocks_only(folder: Path, process: int) -> None:
     """One cheap function of five particles in blocks of two."""
     from joint_cases import five_tests
 
-    from mcc_jax.calibrate.compiling import compiled
-    from mcc_jax.calibrate.sharding import Blocks, require_same
+    from mcc_jax.calibrate.running import Blocks, compiled, require_same
 
     tests = five_tests()
     require_same(tests)
@@ -42,7 +41,7 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int, ev
     from joint_cases import five_particles
 
     from mcc_jax.calibrate import fitting, posterior, sample
-    from mcc_jax.calibrate.sharding import Blocks
+    from mcc_jax.calibrate.running import Blocks
 
     fitting.Blocks = lambda count, size=2: Blocks(count, size)
     posterior.block_size = lambda count: 2

@@ -45,7 +45,7 @@ def test_sensitivity_to_the_prior(by_particle):
     assert np.isfinite(table[["prior", "likelihood"]].astype(float)).all(axis=None)
 
 
-@pytest.mark.parametrize("draw", ["plot_forest", "plot_trace", "plot_dist", "plot_rank", "plot_ess", "plot_pair"])
+@pytest.mark.parametrize("draw", ["plot_forest", "plot_rank", "plot_pair"])
 def test_pictures_of_parameters(by_particle, draw):
     getattr(az, draw)(by_particle["first"], var_names=POPULATION[:3], backend="matplotlib")
 

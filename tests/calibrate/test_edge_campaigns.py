@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,21 +15,15 @@ from mcc_jax.calibrate.data import select
 pytestmark = pytest.mark.extended
 
 METHODS = {
-    "bayes": lambda campaign: sample(campaign, draws=200, chains=2),
-    "least-squares": least_squares,
+    "bayes": partial(sample, draws=200, chains=2, without_flagged=False),
+    "least-squares": partial(least_squares, without_flagged=False),
 }
 methods = pytest.mark.parametrize("method", list(METHODS))
 
 
 def one(name, which, **options):
-    return simulated(
-        COEFFICIENTS[which : which + 1],
-        DIAMETERS[which : which + 1],
-        instrument=NOISE,
-        particles=[name],
-        seed=which,
-        **options,
-    )
+    some = slice(which, which + 1)
+    return simulated(COEFFICIENTS[some], DIAMETERS[some], instrument=NOISE, particles=[name], seed=which, **options)
 
 
 def joined(*campaigns):

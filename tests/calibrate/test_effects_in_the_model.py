@@ -10,10 +10,9 @@ import pytest
 from scipy.special import logsumexp
 
 import mcc_jax as mcc
-from mcc_jax.calibrate.forward import Point, residuals
-from mcc_jax.calibrate.linearisation import Linearisation, coordinates
+from mcc_jax.calibrate.forward import Linearisation, Point, coordinates, residuals
 from mcc_jax.calibrate.marginal import straighten, with_products
-from mcc_jax.calibrate.sharding import Blocks
+from mcc_jax.calibrate.running import Blocks
 from mcc_jax.effects import find_variant
 
 pytestmark = pytest.mark.extended

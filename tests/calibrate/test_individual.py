@@ -27,18 +27,11 @@ def fitted(campaign, noise, unloading=Unloading.PRINTED):
 
 
 def fit(tests, noise, unloading=Unloading.PRINTED, starts=None):
-    middle = _centre(Model(unloading).chosen_priors)
-    centre = np.column_stack([np.broadcast_to(middle, (len(tests), 4)), np.asarray(tests.contact)])
-    width = np.broadcast_to(np.array([ALONE] * 4 + [5.0]), (len(tests), 5))
-    return fit_particles(
-        tests,
-        jnp.full(len(tests), noise),
-        jnp.asarray(centre),
-        jnp.asarray(width),
-        jnp.zeros((len(tests), 0)),
-        jnp.asarray(linear_starts(tests, middle[3])) if starts is None else starts,
-        Forms(unloading),
-    )
+    middle, count = _centre(Model(unloading).chosen_priors), len(tests)
+    centre = np.column_stack([np.broadcast_to(middle, (count, 4)), tests.contact])
+    width = np.broadcast_to([ALONE] * 4 + [5.0], (count, 5))
+    starts = linear_starts(tests, middle[3]) if starts is None else starts
+    return fit_particles(tests, np.full(count, noise), centre, width, np.zeros((count, 0)), starts, Forms(unloading))
 
 
 def rms_um(found, tests):

@@ -94,17 +94,12 @@ def by_scipy(result):
     flat, x, sizes = dense(result)
     jacobian = jax.jit(jax.jacfwd(flat))
     rng = np.random.default_rng(0)
-    start = x + 0.02 * rng.standard_normal(len(x))
-    found = scipy_least_squares(
-        lambda v: np.asarray(flat(jnp.asarray(v))),
-        start,
-        jac=lambda v: np.asarray(jacobian(jnp.asarray(v))),
-        x_scale="jac",
-        xtol=1e-14,
-        ftol=1e-14,
-        gtol=1e-12,
-        max_nfev=500,
-    )
+    start, tolerances = x + 0.02 * rng.standard_normal(len(x)), {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-12}
+
+    def at(function):
+        return lambda v: np.asarray(function(jnp.asarray(v)))
+
+    found = scipy_least_squares(at(flat), start, at(jacobian), x_scale="jac", max_nfev=500, **tolerances)
     return found, x, sizes
 
 

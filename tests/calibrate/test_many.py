@@ -3,11 +3,13 @@
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
 
 from mcc_jax import InputError, calibrate_many, least_squares, sample
+from mcc_jax.calibrate import running
 from mcc_jax.calibrate.data import LENGTHS, padded_length
 
 SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
@@ -26,16 +28,11 @@ def campaigns():
 
 
 @pytest.fixture(scope="module")
-def told():
-    return []
-
-
-@pytest.fixture(scope="module")
-def queued(campaigns, told):
-    """What was found, and the library's functions that were compiled for the first campaign and for all others."""
+def queued(campaigns):
+    """What was found and reported, and our functions that were compiled for the first campaign and for all others."""
     modules = [module for name, module in sys.modules.items() if name.startswith("mcc_jax")]
     ours = {name for module in modules for name, value in vars(module).items() if callable(value)}
-    first, further = [], []
+    told, first, further = [], [], []
 
     def listen(event, _, fun_name="", **__):
         name = fun_name.removeprefix("jit(").removesuffix(")")
@@ -48,19 +45,19 @@ def queued(campaigns, told):
         found = calibrate_many(campaigns, progress=lambda i, step: told.append((i, step)), **SETTINGS)
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    return found, first, further
+    return found, told, first, further
 
 
 @pytest.mark.extended
 def test_campaigns_of_similar_size_share_their_compilations(queued):
-    _, first, further = queued
+    *_, first, further = queued
     assert len(first) > 5
     assert further == []
 
 
 @pytest.mark.extended
-def test_the_numbers_are_those_of_one_by_one_in_order_and_errors_are_in_place(queued, campaigns, told):
-    found, *_ = queued
+def test_the_numbers_are_those_of_one_by_one_in_order_and_errors_are_in_place(queued, campaigns):
+    found, told, *_ = queued
     assert isinstance(found[2], InputError)
     assert "no particle can be used" in str(found[2])
     assert {(0, "done"), (1, "done"), (2, "failed"), (3, "done")} <= set(told)
@@ -91,3 +88,25 @@ def test_wrong_arguments_are_told(campaigns):
     with pytest.raises(TypeError, match="speed"):
         calibrate_many(campaigns, speed=3)
     assert calibrate_many([]) == []
+
+
+@pytest.mark.skipif(not running.MAPS.exists(), reason="only Linux limits memory maps, and shows them")
+@pytest.mark.parametrize(("limit", "times"), [("10\n", 2), (f"{10**9}\n", 1), ("", 1), ("many", 1), (None, 1)])
+def test_compiled_functions_are_forgotten_near_a_known_limit_only(monkeypatch, tmp_path, limit, times):
+    traced = []
+
+    @jax.jit
+    def function(x):
+        traced.append(1)
+        return x + 1
+
+    function(jnp.zeros(3))
+    file = tmp_path / "max_map_count"
+    if limit is None:  # no maps are shown
+        monkeypatch.setattr(running, "MAPS", file)
+    else:
+        file.write_text(limit)
+        monkeypatch.setattr(running, "MAX_MAPS", file)
+    running.make_room()
+    assert function(jnp.ones(3)).tolist() == [2, 2, 2]
+    assert len(traced) == times

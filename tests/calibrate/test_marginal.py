@@ -11,10 +11,12 @@ import pytest
 from joint_cases import (
     COEFFICIENTS,
     DIAMETERS,
+    KINDS,
     POINTS,
     dense,
     random_marginal,
     random_population,
+    random_precision,
     random_tests,
     true_latent,
 )
@@ -22,11 +24,11 @@ from scipy.special import roots_hermitenorm
 from scipy.stats import multivariate_normal
 
 from mcc_jax import Model
-from mcc_jax.calibrate.forward import Point
-from mcc_jax.calibrate.linearisation import Straight
+from mcc_jax.calibrate.forward import Point, Straight
 from mcc_jax.calibrate.marginal import Marginal, summarise
-from mcc_jax.calibrate.noise import Along, Correlation, Noise
+from mcc_jax.calibrate.noise import Noise
 from mcc_jax.calibrate.population import Scatter, moments
+from mcc_jax.calibrate.small_matrices import Cholesky
 from mcc_jax.campaign import particle_batch
 from mcc_jax.law import StrainScaling
 
@@ -262,24 +264,14 @@ def test_summaries_of_linear_tests_are_exact(known):
     rng, four, zero_prior = np.random.default_rng(4), (0.2, 0.3, 0.5, 0.3), (0.7, 2.0)
     tests, linear = random_tests(rng, count=3, zero_sd=known, peak_sd=known)
     tests = replace(tests, particle=particle_batch(DIAMETERS[:3]))
-    linear = replace(
-        linear, columns=jnp.asarray(rng.standard_normal((3, POINTS, 6)) * np.asarray(tests.mask)[..., None])
-    )
+    columns = rng.standard_normal((3, POINTS, 6)) * np.asarray(tests.mask)[..., None]
+    linear = replace(linear, columns=jnp.asarray(columns))
     scatter = Scatter(modulus=True, varying=((0, True),))
     latent, theta = true_latent()[:3], np.array([0.4, 1.5])
     point = Point(jnp.asarray(latent), jnp.asarray(rng.standard_normal(3)), jnp.asarray(np.tile(theta, (3, 1))))
     noise = Noise.of(four, jnp.asarray([0.5, 1.0, 2.0]))
-    marginal = summarise(
-        point,
-        Straight.of(3, *2 * (np.zeros(2),)),
-        tests,
-        linear,
-        noise,
-        jnp.asarray(zero_prior),
-        scatter,
-        Correlation.EXPONENTIAL,
-        Along.LOAD,
-    ).marginal
+    straight = Straight.of(3, *2 * (np.zeros(2),))
+    marginal, *_ = summarise(point, straight, tests, linear, noise, jnp.asarray(zero_prior), scatter, *KINDS[0])
     log_eta = np.log(1 + 1.2 * np.asarray(tests.flatness))
     effects = {"theta": theta + 0.3, "theta_scatter": np.array([0.6])}
     mu, e = np.log(COEFFICIENTS[0]) + 0.05, latent[0, 3] - 0.2
@@ -298,3 +290,31 @@ def test_summaries_of_linear_tests_are_exact(known):
         law = multivariate_normal((X @ u[i] + zero)[mask], total[mask][:, mask])
         expected = law.logpdf(np.asarray(linear.residual[i])[mask])
         np.testing.assert_allclose(actual[i], expected, rtol=1e-9, atol=1e-4)
+
+
+# ---- Cholesky factors written out entry by entry, against LAPACK -----------------------------------------------------
+
+
+@jax.jit
+def everything(A, b):
+    factor = Cholesky(A)
+    return factor.solve(b), factor.forward(b), factor.backward(b), factor.inverse(), factor.log_det()
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+@pytest.mark.parametrize("size", [1, 2, 5])
+@pytest.mark.parametrize("spread", [0.0, 1.0, 3.0])
+def test_a_factor_solves_inverts_and_has_the_determinant(size, batch, spread):
+    rng = np.random.default_rng(size)
+    A = random_precision(rng, int(np.prod(batch)), size, spread=spread).reshape(*batch, size, size)
+    b, tolerance = rng.standard_normal((*batch, size)), np.linalg.cond(A).max() * size * 1e-14
+    solved, forward, backward, inverse, log_det = (np.asarray(v) for v in everything(A, b))
+    assert (solved.shape, inverse.shape, log_det.shape) == (b.shape, A.shape, batch)
+    expected, L = np.linalg.inv(A), np.linalg.cholesky(A)
+    scale, scale_of_L = np.abs(expected).max(), np.abs(np.linalg.inv(L)).max()
+    np.testing.assert_allclose(inverse, expected, rtol=0, atol=tolerance * scale)
+    np.testing.assert_allclose(log_det, np.linalg.slogdet(A)[1], rtol=0, atol=1e-12 + tolerance)
+    for found, matrix, unit in ((solved, A, scale), (forward, L, scale_of_L), (backward, L.mT, scale_of_L)):
+        wanted = np.linalg.solve(matrix, b[..., None])[..., 0]
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=10 * tolerance * unit)

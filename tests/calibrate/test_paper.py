@@ -7,7 +7,6 @@ import pytest
 from helpers import INSTRUMENTS
 
 from mcc_jax import InputError, Instrument, Programme, Ramp, calibrate_paper, paper_campaign
-from mcc_jax.calibrate import sharding
 from mcc_jax.campaign import read_instrument_file
 
 
@@ -35,17 +34,6 @@ def test_particles_with_their_own_coefficients_are_described_by_them(result):
         assert particle.own_rms_um < 0.5 * particle.rms_um or particle.own_rms_um < 0.5
         assert particle.measured_um.shape == particle.predicted_um.shape == particle.own_um.shape
         assert len(particle.measured_um) == len(result.campaign.curves[i])
-
-
-@pytest.mark.extended
-def test_what_fills_up_counts_for_nothing(result, monkeypatch):
-    few = result.campaign.select(np.arange(20) < 5)
-    numbers = []
-    for size in (5, 20):
-        monkeypatch.setattr(sharding, "BLOCK", size)
-        found = calibrate_paper(few)
-        numbers.append([number for one in found.particles for number in (*one.plastic, one.rms_um)])
-    np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-8)
 
 
 def test_the_reference_can_be_named_and_used(result):

@@ -33,8 +33,6 @@ def inside(draws, truth, share):
 def test_it_converges(result):
     assert result.converged, result.failures()
     assert result.divergences == 0
-    assert max(result.rhat.values()) <= 1.01
-    assert min(result.ess_bulk.values()) >= 400
 
 
 def test_what_all_particles_share_is_recovered(result):
@@ -226,12 +224,8 @@ def gap(one, two):
     axes = {"chain_axis": 0, "draw_axis": 1}
     error = [float(array_stats.mcse(d, method="mean", **axes)) / sd for d in (one, two)]
     of_sd = [float(array_stats.mcse(d, method="sd", **axes)) / sd for d in (one, two)]
-    return (
-        abs(one.mean() - two.mean()) / sd,
-        abs(np.log(one.std() / sd)),
-        float(np.hypot(*error)),
-        float(np.hypot(*of_sd)),
-    )
+    away, wider = abs(one.mean() - two.mean()) / sd, abs(np.log(one.std() / sd))
+    return away, wider, float(np.hypot(*error)), float(np.hypot(*of_sd))
 
 
 @pytest.mark.extended

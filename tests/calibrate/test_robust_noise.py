@@ -9,7 +9,7 @@ import pytest
 from joint_cases import NOISE
 from numpyro.infer.util import log_density
 
-from mcc_jax import InputError, Model, compare, least_squares, log_evidence, paper_campaign, sample
+from mcc_jax import InputError, Model, compare, least_squares, paper_campaign, sample
 from mcc_jax.calibrate import select_tests
 from mcc_jax.calibrate.noise import standard_promotion, student_weights
 
@@ -88,5 +88,3 @@ def test_what_cannot_be_is_refused(clean):
         least_squares(clean, Model(robust=True), loss="cauchy")
     with pytest.raises(InputError, match="robust=False"):
         compare(clean, [Model(), Model(robust=True)])
-    with pytest.raises(InputError, match="robust=False"):
-        log_evidence(clean, Model(robust=True))

@@ -13,7 +13,7 @@ import pytest
 from joint_cases import five_tests
 from spread_run import squares
 
-from mcc_jax.calibrate.sharding import BLOCKS, Blocks, block_size, padded
+from mcc_jax.calibrate.running import BLOCKS, Blocks, block_size, padded
 
 pytestmark = pytest.mark.extended
 
@@ -60,34 +60,27 @@ def arrays(folder, process=0):
         return {name: file[name] for name in file.files}
 
 
+def calibrated(folder, processes=1, devices=1):
+    """The folder that so many processes with so many devices each wrote into."""
+    port = free_port()
+    finish(folder, [start(folder, devices, processes, process, port) for process in range(processes)])
+    return folder
+
+
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("alone")
-    finish(folder, [start(folder)])
-    return folder
+    return calibrated(tmp_path_factory.mktemp("alone"))
 
 
 @pytest.fixture(scope="module")
 def two_processes(tmp_path_factory):
-    folder, port = tmp_path_factory.mktemp("two_processes"), free_port()
-    finish(folder, [start(folder, processes=2, process=i, port=port) for i in range(2)])
-    return folder
-
-
-@pytest.fixture(scope="module")
-def four_devices(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("four_devices")
-    finish(folder, [start(folder, devices=4)])
-    return folder
+    return calibrated(tmp_path_factory.mktemp("two_processes"), processes=2)
 
 
 def assert_same(found, wanted):
     assert found.keys() == wanted.keys()
     for name, values in wanted.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-8, atol=1e-8, err_msg=name)
-        if name == "C":  # of every draw, not of the sum alone
-            np.testing.assert_allclose(found[name].mean((0, 1)), values.mean((0, 1)), rtol=1e-8)
-            np.testing.assert_allclose(found[name].std((0, 1)), values.std((0, 1)), rtol=1e-8)
 
 
 def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
@@ -109,13 +102,15 @@ def test_two_processes_give_the_numbers_of_one(alone, two_processes, process):
 FITS = ("mode", "covariance", "noise", "noise_log_sd", "scale", "latent", "residual", "variance")
 
 
-def test_four_devices_give_the_fits_of_one_and_its_posterior(alone, four_devices):
+def test_four_devices_give_the_fits_of_one_and_its_posterior(alone, tmp_path):
     """Draws are other draws: a sampler amplifies the last bits, in which devices of a processor differ."""
+    four_devices = calibrated(tmp_path, devices=4)
     assert json.loads((four_devices / "devices_0.json").read_text()) == {"devices": 4, "processes": 1}
     found, wanted = arrays(four_devices), arrays(alone)
     assert found.keys() == wanted.keys()
     for name in FITS:
-        scale = np.max(np.abs(wanted[name]))
+        # Residuals are differences of displacements of some 100 um.
+        scale = 100.0 if name == "residual" else np.max(np.abs(wanted[name]))
         np.testing.assert_allclose(found[name], wanted[name], rtol=1e-6, atol=1e-8 * scale, err_msg=name)
     for name in ("a", "effective_modulus_MPa", "mu_C1", "mu_C5"):
         error = wanted[name].std() * (2 / 40) ** 0.5  # a bulk ESS of 40 at least in 120 draws

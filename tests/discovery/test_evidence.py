@@ -9,7 +9,7 @@ from campaigns import base_of, cached, with_curves
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
-from mcc_jax import Model, log_evidence
+from mcc_jax import Model, sample
 from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.calibrate.priors import SCALES, nuisance_moments
 from mcc_jax.discovery.design import ExtraColumns, design_of
@@ -148,7 +148,7 @@ def test_a_step_that_is_cut_short_is_cut_for_all_numbers(base):
 def test_it_prefers_a_model_as_much_as_importance_sampling_does(base):
     campaign = cached(f"frame_compliance={COMPLIANCE}")
     model = Model(modulus_scatter=True)
-    found = [log_evidence(campaign, m).value for m in (model, model.with_effects("frame_compliance:linear"))]
+    found = [sample(campaign, m).log_evidence[0] for m in (model, model.with_effects("frame_compliance:linear"))]
     nothing = fit_hypothesis(base, base.state, (), np.zeros(0), base.hyperparameters)
     variant = find_variant("frame_compliance:linear")
     frame = fit_hypothesis(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.hyper)

@@ -1,4 +1,4 @@
-"""Particles in blocks of a fixed size, spread over the processes and the devices of each.
+"""How the functions of a calibration are compiled, and run: on threads, and in blocks of particles over processes.
 
 What is done to a particle does not depend on the others, but the bits of its numbers depend on the program that
 computes them, and a sampler that sees other bits draws another chain. So the program is one for a block of particles,
@@ -13,18 +13,70 @@ processor's devices share its threads, and sums are divided otherwise. Their dra
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from typing import Any
+import importlib
+import os
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, cast
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from threadpoolctl import threadpool_limits
 
 from .._errors import InputError
+from .._numerics import compiled as compiled
 from ..arguments import is_traced
-from .compiling import compiled
 from .data import Tests
+
+MAPS = Path("/proc/self/maps")
+MAX_MAPS = Path("/proc/sys/vm/max_map_count")
+FULL = 0.6  # share of the memory maps a process may have at which compiled functions are forgotten
+
+
+def compiled_quickly[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """`compiled` for what runs a few times only: another third less time to compile, at some times less speed."""
+    return compiled(function, 0)
+
+
+def imported_meanwhile(*names: str) -> None:
+    """Import what is needed later while the first programs are compiled: together they would take seconds longer."""
+    for name in names:
+        threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
+
+
+def one_blas_thread[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """A function with one thread of NumPy's BLAS: matrices are small here, and its waiting threads take the cores from
+    JAX, on two of which all would take a third longer."""
+    return cast(Any, threadpool_limits.wrap(limits=1, user_api="blas"))(function)
+
+
+def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> list[B]:
+    """What a function returns for each of its arguments, on as many threads as there are cores."""
+    arguments = list(arguments)
+    if len(arguments) == 1:
+        return [function(arguments[0])]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(function, arguments))
+
+
+def make_room() -> None:
+    """Forget what JAX has compiled where the process would soon hold more memory maps than Linux allows, 65,530. A
+    campaign of a new length takes over a thousand; without any left XLA fails ("Cannot allocate memory")."""
+    try:
+        with MAPS.open("rb") as lines:
+            used = sum(1 for _ in lines)
+        most = int(MAX_MAPS.read_text())
+    except (OSError, ValueError):
+        return
+    if used > FULL * most:
+        jax.clear_caches()
+
+
+# ---- blocks of particles ---------------------------------------------------------------------------------------------
 
 AXIS = "particles"  # the only axis of the mesh of a process's devices
 
@@ -58,7 +110,6 @@ class Blocks:
     """`count` particles in `number` blocks of `size`, the last one padded, of which each process has its own."""
 
     def __init__(self, count: int, size: int = 0) -> None:
-        """Cut `count` particles into blocks of `size`; of `block_size` if 0."""
         self.count, self.size = count, size or block_size(count)
         self.number = -(-count // self.size)
         # A single block is computed by every process for itself: that is quicker than to wait for another's.
@@ -110,8 +161,7 @@ class Blocks:
         whole = jax.tree.map(lambda *several: np.concatenate(list(map(np.asarray, several)))[:own], *parts)
         if self.processes > 1:
             leaves, structure = jax.tree.flatten(whole)
-            leaves = [np.concatenate(several) for several in zip(*_exchanged(leaves), strict=True)]
-            whole = jax.tree.unflatten(structure, leaves)
+            whole = jax.tree.unflatten(structure, [np.concatenate(of_processes) for of_processes in _exchanged(leaves)])
         return jax.tree.map(lambda x: jax.device_put(x[: self.count]), whole)
 
 
@@ -126,26 +176,20 @@ def _on_all_devices(particles: Any, shared: Any, function: Any, mesh: Any) -> An
         own, common = eqx.combine(arrays, rest)
         return function(*own, *common)
 
-    return jax.shard_map(run, mesh=mesh, in_specs=((cut, whole),), out_specs=PartitionSpec(AXIS), check_vma=False)(
-        arrays
-    )
+    specs: Any = {"in_specs": ((cut, whole),), "out_specs": PartitionSpec(AXIS)}
+    return jax.shard_map(run, mesh=mesh, check_vma=False, **specs)(arrays)
 
 
-def _exchanged(arrays: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """The same arrays of every process, in the order of the processes."""
+def _exchanged(arrays: list[np.ndarray]) -> list[np.ndarray]:
+    """Arrays of all processes, with the processes along a first axis."""
     from jax.experimental.multihost_utils import process_allgather
 
     # As bytes, in one message: no conversion touches a bit.
-    message = np.concatenate([np.frombuffer(np.ascontiguousarray(x).tobytes(), np.uint8) for x in arrays])
+    message = np.concatenate([np.frombuffer(x.tobytes(), np.uint8) for x in arrays])
     received = np.asarray(process_allgather(message))
-    ends = np.cumsum([x.nbytes for x in arrays])
-    return [
-        [
-            np.frombuffer(row[end - x.nbytes : end].tobytes(), x.dtype).reshape(x.shape)
-            for x, end in zip(arrays, ends, strict=True)
-        ]
-        for row in received
-    ]
+    parts = np.split(received, np.cumsum([x.nbytes for x in arrays])[:-1], axis=1)
+    each = ((x, np.ascontiguousarray(part).view(x.dtype)) for x, part in zip(arrays, parts, strict=True))
+    return [part.reshape(len(received), *x.shape) for x, part in each]
 
 
 def require_same(tests: Tests) -> None:
@@ -155,8 +199,9 @@ def require_same(tests: Tests) -> None:
     digest = hashlib.sha256()
     for x in jax.tree.leaves(tests):
         digest.update(repr(x.shape).encode())
-        digest.update(np.ascontiguousarray(np.asarray(x)).tobytes())
-    if len({bytes(one[0]) for one in _exchanged([np.frombuffer(digest.digest(), np.uint8)])}) > 1:
+        digest.update(np.asarray(x).tobytes())
+    (digests,) = _exchanged([np.frombuffer(digest.digest(), np.uint8)])
+    if len(np.unique(digests, axis=0)) > 1:
         raise InputError(
             "the processes were given different tests",
             remedy="Every process must call the calibration with the same campaign and the same settings.",
