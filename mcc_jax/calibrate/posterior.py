@@ -14,7 +14,7 @@ from .. import arguments
 from .._format import first_few
 from .._types import Progress
 from ..campaign import THRESHOLD_MPA, Campaign, check_plausibility, check_tests
-from ..campaign.findings import worst
+from ..campaign.findings import has_error
 from .draws import Fit, draw_fast, draw_joint, effect_numbers
 from .estimates import effect_entries, finite, summary
 from .fitting import Start, checked_settings, prepare
@@ -267,7 +267,7 @@ def sample(
         progress("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         if fast:
-            plausible = worst(check_plausibility(campaign)) != "error"
+            plausible = not has_error(check_plausibility(campaign))
             drawn = draw_fast(key, fit, length, block_size(len(fit.tests)), fallback=plausible)
         else:
             drawn = draw_joint(key, fit, length)

@@ -141,14 +141,22 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     """
     segments = campaign_segments(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    tests = list(zip(campaign.curves, campaign.diameters_um, segments, strict=True))
-    curves = [loading_curve(*test) for test in tests]
-    reasons = [_why_not(curve, *test, threshold_MPa) for curve, test in zip(curves, tests, strict=True)]
-    used = {i: c for i, (c, reason) in enumerate(zip(curves, reasons, strict=True)) if c is not None and not reason}
+    used: dict[int, LoadingCurve] = {}
+    reasons: list[Finding | None] = []
+    for i, test in enumerate(zip(campaign.curves, campaign.diameters_um, segments, strict=True)):
+        loading = loading_curve(*test)
+        if loading is None:
+            stress, _ = stress_and_strain(*test)
+            reasons.append(no_loading(campaign.curves[i], segments[i], stress, threshold_MPa))
+            continue
+        strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]
+        climb_um = strain * effective_diameter_um(campaign.diameters_um[i])
+        reasons.append(no_curve(climb_um, loading.stress_max_MPa, threshold_MPa, least_points=LEAST_LEVELS))
+        if reasons[i] is None:
+            used[i] = loading
     apart = far_apart({i: (curve.stress_max_MPa, float(np.ptp(curve.strain[1:]))) for i, curve in used.items()})
-    reasons = tuple(apart.get(i, reason) for i, reason in enumerate(reasons))
     used = {i: curve for i, curve in used.items() if i not in apart}
-    shift, mean = np.zeros(len(tests)), 0.0
+    shift, mean = np.zeros(len(campaign)), 0.0
     if threshold_MPa > 0 and used:
         strain = {i: float(curve.at(threshold_MPa)) for i, curve in used.items()}
         mean = float(np.mean(list(strain.values())))
@@ -159,23 +167,9 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
                 np.concatenate([[0.0, threshold_MPa], curve.stress_MPa[above]]),
                 np.concatenate([[0.0, mean], curve.strain[above] + shift[i]]),
             )
-    curves = tuple(used.get(i) for i in range(len(tests)))
-    return Adjustment(curves, shift, threshold_MPa, mean, reasons, segments)
-
-
-def _why_not(
-    loading: LoadingCurve | None,
-    curve: Curve,
-    diameters_um: np.ndarray,
-    segments: tuple[Segment, ...],
-    threshold_MPa: float,
-) -> Finding | None:
-    """Why a test cannot be used; None if it can."""
-    if loading is None:
-        return no_loading(curve, segments, stress_and_strain(curve, diameters_um, segments)[0], threshold_MPa)
-    strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]
-    climb_um = strain * effective_diameter_um(diameters_um)
-    return no_curve(climb_um, loading.stress_max_MPa, threshold_MPa, least_points=LEAST_LEVELS)
+    curves = tuple(used.get(i) for i in range(len(campaign)))
+    why_not = tuple(apart.get(i, reason) for i, reason in enumerate(reasons))
+    return Adjustment(curves, shift, threshold_MPa, mean, why_not, segments)
 
 
 def _reason(sentence: str, remedy: str) -> Finding:

@@ -59,11 +59,9 @@ class Finding:
         return cls(**{**entry, "particles": tuple(entry["particles"])})
 
 
-def worst(findings: Iterable[Finding]) -> Level | None:
-    """The most serious level among findings, None where there are none."""
-    levels = {one.level for one in findings}
-    order: tuple[Level, ...] = ("error", "warning", "info")
-    return next((level for level in order if level in levels), None)
+def has_error(findings: Iterable[Finding]) -> bool:
+    """Whether the numbers are not to be trusted before something is settled."""
+    return any(one.level == "error" for one in findings)
 
 
 def named(names: tuple[str, ...], of: int, most: int = 5) -> str:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from . import unit_errors
-from .findings import Finding, Level, worst
+from .findings import Finding, Level, has_error
 from .paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from .schema import Campaign, Curve, check_campaign, remembered
 from .unit_errors import CurveFeatures, UnitError, apparent, beyond, curve_features, in_words, log_density
@@ -42,7 +42,7 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
     tests = _tests(campaign)
-    if not tests.names or worst(tests.findings) == "error":
+    if not tests.names or has_error(tests.findings):
         return tests.findings
     fitted = _fitted_modulus(_typical(tests.numbers), modulus_MPa)
     material = None if tests.findings else _material(tests)
@@ -61,7 +61,7 @@ class Material(NamedTuple):
 def other_material(campaign: Campaign) -> Material | None:
     """The material of the tests; None if it is the paper's, or a wrong unit or sign is more likely."""
     tests = _tests(check_campaign(campaign))
-    return None if not tests.names or worst(tests.findings) == "error" else _material(tests)
+    return None if not tests.names or has_error(tests.findings) else _material(tests)
 
 
 def add_likely_unit_error(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:

@@ -126,8 +126,9 @@ def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, flo
         clean = replace(clean, force_mN=clean.force_mN - zero.path)
     compared, force_sd = np.ones(len(clean), bool), np.zeros(len(clean))
     if (seen := censor_force(clean)) is not None:
-        found.append(seen.finding)
-        clean, rows, compared, force_sd = seen.curve, rows[seen.rows], seen.compared, seen.force_sd_mN
+        clean, kept = seen
+        rows, compared, force_sd = rows[kept.rows], kept.compared, kept.force_sd_mN
+        found += kept.findings
     if (hidden := censor_displacement(clean)) is not None:
         found.append(hidden[1])
         compared = compared & ~hidden[0]

@@ -15,7 +15,7 @@ from .._errors import InputError
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need, Record
 from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
 from .adjustment import campaign_segments
-from .schema import Campaign, Curve, check_campaign
+from .schema import Campaign, Curve
 from .segments import Segment
 from .signal import Line
 
@@ -192,14 +192,13 @@ def _best_kink(x: np.ndarray, y: np.ndarray) -> tuple[float, int]:
     return float(gain[kink]), kink + 1
 
 
-def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
-    """What a campaign holds of what effects need; segments are found if they are None.
+def available_data(campaign: Campaign) -> frozenset[Need]:
+    """What a campaign holds of what effects need.
 
     A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
     tenth; peaks and rates when the largest is 1.3 times the smallest.
     """
-    check_campaign(campaign)
-    found = campaign_segments(campaign) if segments is None else segments
+    found = campaign_segments(campaign)
     D1, D2, D3 = campaign.diameters_um.T
     kinds = [[segment.kind for segment in parts] for parts in found]
     least = max(1.0, 0.2 * len(campaign))

@@ -13,12 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from .findings import Finding
-from .schema import Curve
+from .schema import Checked, Curve
 from .signal import Line, differences, point_noise, quantile, runs
 
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
@@ -58,17 +57,6 @@ DISPLACEMENT_RANGE = Finding(
 )
 
 
-class CensoredForce(NamedTuple):
-    """A test without the readings at the end of the force channel's range, but for one turning point, not to be
-    compared, for each stretch of them that goes beyond any displacement reached before."""
-
-    curve: Curve
-    rows: np.ndarray  # of the given curve
-    compared: np.ndarray
-    force_sd_mN: np.ndarray  # 0 but at the turning points
-    finding: Finding
-
-
 def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float) -> list[tuple[int, int]]:
     """Stretches [start, stop) at the largest value of a channel during which the other, of this noise, goes on."""
     starts, stops = runs(values)
@@ -100,9 +88,10 @@ def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: flo
     return [one for one in at_end if one[1] - one[0] >= 2] if found else []
 
 
-def censor_force(curve: Curve) -> CensoredForce | None:
-    """The test, its zero of force taken off, with the turning points that its force channel did not see; None if there
-    are none."""
+def censor_force(curve: Curve) -> tuple[Curve, Checked] | None:
+    """The test, its zero of force taken off, without the readings at the end of the force channel's range, but for one
+    turning point, not to be compared, for each stretch of them that goes beyond any displacement reached before; None
+    if there are none."""
     force, path = curve.force_mN, curve.displacement_um
     noise = point_noise(path)
     found = plateaus(force, path, curve.time_s, noise)
@@ -137,8 +126,8 @@ def censor_force(curve: Curve) -> CensoredForce | None:
         far = largest > (1 + TRUSTED) * end or not error < 0.5 * TRUSTED * end
         finding = (FAR_BEYOND if far else TURNING_POINT).of(*finding.numbers, largest, error)
     keep = ~hidden | turning
-    checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
-    return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], finding)
+    seen = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
+    return seen, Checked(np.flatnonzero(keep), ~turning[keep], 0.0, 0.0, sd[keep], (finding,))
 
 
 def censor_displacement(curve: Curve) -> tuple[np.ndarray, Finding] | None:

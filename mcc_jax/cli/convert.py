@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
@@ -63,47 +64,29 @@ def convert(
       header = "Gage length"
     """
     with session() as progress:
-        from .._format import span
-        from ..campaign import (
-            campaign_findings,
-            check_plausibility,
-            check_tests,
-            find_segments,
-            read_diameters,
-            read_instrument_file,
-            write_campaign,
-        )
+        from .. import campaign
+        from .._format import counted, span
 
         progress("reading")
-        sizes = None if diameters is None else read_diameters(diameters)
-        given = [*mapping, *([] if diameters is None else [Path(diameters)])]
-        leave_out += tuple(path.name for path in given if _lies_in(path, file) and path.name not in leave_out)
-        campaign = read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=leave_out)
+        sizes = None if diameters is None else campaign.read_diameters(diameters)
+        tables = [Path(str(diameters))] if isinstance(sizes, Mapping) else []
+        # Files given by other options may lie among the tests, and are none of them.
+        leave_out += tuple(path.name for path in (*mapping, *tables) if path.resolve().parent == file.resolve())
+        tests = campaign.read_instrument_file(file, diameters_um=sizes, mapping=mapping or None, skip=leave_out)
         progress("finding the segments")
-        segments = Counter(part.kind for curve in campaign.curves for part in find_segments(curve))
+        segments = Counter(part.kind for curve in tests for part in campaign.find_segments(curve))
         progress("writing")
-        write_campaign(campaign, out)
-    points = sum(len(curve) for curve in campaign.curves)
-    source = (campaign.metadata.provenance or "").partition(";")[0]
-    say(f"{len(campaign)} test{'s' if len(campaign) > 1 else ''}, {points} points ({source}).")
-    force = [float(curve.force_mN.max()) for curve in campaign.curves]
-    displacement = [float(curve.displacement_um.max()) for curve in campaign.curves]
+        campaign.write_campaign(tests, out)
+    points = sum(len(curve) for curve in tests)
+    source = (tests.metadata.provenance or "").partition(";")[0]
+    say(f"{counted(len(tests), 'test')}, {points} points ({source}).")
+    force = [float(curve.force_mN.max()) for curve in tests]
+    displacement = [float(curve.displacement_um.max()) for curve in tests]
     say(f"Max force {span(force, 'mN')}, max displacement {span(displacement, 'um')}.")
     say("Segments: " + ", ".join(f"{segments[kind]} {kind}" for kind in KINDS) + ".")
-    for finding in campaign.metadata.other.get("conversion", {}).get("findings", ()):
-        say(f"Note: {finding['sentence']}." + (f" {finding['remedy']}." if finding["remedy"] else ""))
-    for one in (*check_plausibility(campaign), *campaign_findings(check_tests(campaign))):
+    noted = map(campaign.Finding.from_json, tests.metadata.other.get("conversion", {}).get("findings", ()))
+    found = campaign.campaign_findings(campaign.check_tests(tests))
+    for one in (*noted, *campaign.check_plausibility(tests), *found):
         say(f"{'Warning' if one.level != 'info' else 'Note'}: {one}", fg="red" if one.level == "error" else "yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say_next((f"mcc-jax calibrate {shlex.quote(str(out))} --out fit", "the law and its uncertainty"))
-
-
-def _lies_in(path: Path, folder: Path) -> bool:
-    """Whether a file given by another option lies among the tests, which is then none of them."""
-    from ..campaign.readers.folder import passed_over
-
-    try:
-        inside = folder.is_dir() and path.is_file() and path.resolve().parent == folder.resolve()
-    except (OSError, ValueError):  # three long numbers are no name of a file
-        return False
-    return inside and not passed_over(path.name)

@@ -61,7 +61,7 @@ def demo(out: Path, seed: int) -> None:
     with session() as progress, results(out) as stage:
         effect, sealed = sealed_answer(seed)
         say("Something that the law does not contain is hidden in simulated tests. The answer is sealed, SHA-256:")
-        say(f"  {seal_of(sealed)}", bold=True)
+        say(f"  {hashlib.sha256(sealed.encode()).hexdigest()}", bold=True)
         calibration, found = _job(stage, effect, {"seed": seed, "hidden": "sealed"}, progress)
         (stage.folder / SEALED).write_text(sealed, encoding="utf-8")
         inner = Stage(stage.directory / NOTHING, stage.folder / NOTHING)
@@ -184,11 +184,6 @@ def sealed_answer(seed: int) -> tuple[HiddenEffect, str]:
         "nonce": rng.bytes(16).hex(),
     }
     return HiddenEffect(variant, amplitude), json.dumps(answer) + "\n"
-
-
-def seal_of(text: str) -> str:
-    """What `sha256sum sealed.json` gives, too."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:

@@ -89,13 +89,7 @@ no_seed = click.option("--seed", type=whole_number, hidden=True, expose_value=Fa
 
 def diameters(help: str) -> Any:
     """`--diameters`: three lengths or a table."""
-
-    def given(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
-        if value is not None and not value.strip():
-            raise click.BadParameter("it is empty.", ctx, param)
-        return value
-
-    return option("--diameters", "D1,D2,D3|FILE", str, help, callback=given)
+    return option("--diameters", "D1,D2,D3|FILE", str, help)
 
 
 def threshold(use: str = ": points below it do not count.", default: float = 0.2) -> Any:

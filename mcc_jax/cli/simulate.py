@@ -28,8 +28,9 @@ MAX_ROWS = 10_000_000
 LONGEST_S = 1e12
 
 
-def _zero(name: str, unit: str, text: str) -> Any:
-    return option(name, unit, NOT_NEGATIVE, text, default=0.0, show_default=True)
+def _read_out(name: str, unit: str, field: str, text: str) -> Any:
+    """An option for a field of `Instrument`."""
+    return option(name, unit, NOT_NEGATIVE, text, variable=field, default=0.0, show_default=True)
 
 
 @click.command(short_help="Test particles in the computer.")
@@ -70,11 +71,11 @@ def _zero(name: str, unit: str, text: str) -> Any:
     "NAME[:VARIANT][=X][,P=V]",
     "An effect that the law does not contain; repeatable.  [default amplitude: the middle of what is plausible]",
 )
-@_zero("--noise-um", "um", "Standard deviation of noise on displacement.")
-@_zero("--noise-mN", "mN", "Standard deviation of noise on force.")
-@_zero("--resolution-um", "um", "Smallest step of displacement.")
-@_zero("--resolution-mN", "mN", "Smallest step of force.")
-@_zero("--zero-um", "um", "Standard deviation of each test's zero of displacement.")
+@_read_out("--noise-um", "um", "displacement_noise_um", "Standard deviation of noise on displacement.")
+@_read_out("--noise-mN", "mN", "force_noise_mN", "Standard deviation of noise on force.")
+@_read_out("--resolution-um", "um", "displacement_resolution_um", "Smallest step of displacement.")
+@_read_out("--resolution-mN", "mN", "force_resolution_mN", "Smallest step of force.")
+@_read_out("--zero-um", "um", "zero_um", "Standard deviation of each test's zero of displacement.")
 @common.seed()
 def simulate(out: Path, **options: Any) -> None:
     """Put particles through a test programme in the computer and write the campaign into DIR.
@@ -104,9 +105,10 @@ def simulate(out: Path, **options: Any) -> None:
     _refuse_contradictions(options)
     with session() as progress:
         from ..campaign import write_campaign
+        from ..simulate import read_effect
 
         progress("reading the input")
-        particles, hidden = _particles(options["particles"]), [_hidden_effect(text) for text in options["effects"]]
+        particles, hidden = _particles(options["particles"]), [read_effect(text) for text in options["effects"]]
         progress("simulating")
         campaign = _simulated(particles, hidden, options)
         progress("writing")
@@ -164,16 +166,6 @@ def _particles(file: Path | None) -> tuple[Any, Any, Any]:
     return names, diameters_um, {key: cells for key, cells in columns.items() if not key.startswith("true_")}
 
 
-def _hidden_effect(text: str) -> HiddenEffect:
-    """The effect that an option --effect describes."""
-    from ..simulate import read_effect
-
-    try:
-        return read_effect(text)
-    except InputError as error:
-        raise error.changed(file=f"--effect {text}") from error
-
-
 def _simulated(particles: tuple[Any, Any, Any], hidden: Sequence[HiddenEffect], options: Mapping[str, Any]) -> Campaign:
     """The campaign, with the further columns of the particles' table."""
     from ..campaign import check_campaign
@@ -194,13 +186,7 @@ def _simulated(particles: tuple[Any, Any, Any], hidden: Sequence[HiddenEffect], 
         raise InputError(problem, file=options["particles"], remedy="Give an --a nearer to zero")
     laws = _laws(len(names), options)
     peaks = _peaks(laws, diameters_um, programme, options)
-    instrument = Instrument(
-        displacement_noise_um=options["noise_um"],
-        force_noise_mN=options["noise_mN"],
-        displacement_resolution_um=options["resolution_um"],
-        force_resolution_mN=options["resolution_mN"],
-        zero_um=options["zero_um"],
-    )
+    instrument = Instrument(**{field.name: options[field.name] for field in dataclasses.fields(Instrument)})
     humidity = humidity_column(names, columns, str(options["particles"] or "")) if hidden else None
     try:
         _check_size(programme, peaks)
@@ -225,14 +211,13 @@ def _simulated(particles: tuple[Any, Any, Any], hidden: Sequence[HiddenEffect], 
 def _laws(count: int, options: Mapping[str, Any]) -> MccLaw:
     """One law per particle, of fixed or drawn coefficients."""
     import equinox as eqx
-    import jax.numpy as jnp
+    import jax
 
     from ..law import Plastic
-    from ..simulate import law_for_each
-    from ..simulate.campaign import draw_plastic
+    from ..simulate import law_for_each, paper_population
 
-    drawn = draw_plastic(count, options["seed"], shared=False)
-    fixed = {name: jnp.full(count, options[name]) for name in COEFFICIENTS if options[name] is not None}
+    drawn = paper_population().sample(jax.random.key(options["seed"]), count)
+    fixed = {name: jax.numpy.full(count, options[name]) for name in COEFFICIENTS if options[name] is not None}
     plastic = eqx.filter_vmap(Plastic)(*(fixed.get(name, getattr(drawn, name)) for name in COEFFICIENTS))
     form = options["unloading"], options["strain_scaling"]
     return law_for_each(plastic, options["a"], options["effective_modulus"], *form)
@@ -253,11 +238,8 @@ def _peaks(laws: MccLaw, diameters_um: np.ndarray, programme: Programme, options
     if options["peak_strain"] is None:
         return peaks_at_stress(laws, particles, drawn, programme.control)
     if programme.control != "displacement":
-        problem, remedy = (
-            "--peak-strain has no meaning under load control",
-            "Give --peak-stress or --control displacement",
-        )
-        raise InputError(problem, file=options["programme"], remedy=remedy)
+        remedy = "Give --peak-stress or --control displacement"
+        raise InputError("--peak-strain has no meaning under load control", file=options["programme"], remedy=remedy)
     return np.asarray(eqx.filter_vmap(Particle.displacement)(particles, drawn))
 
 

@@ -14,7 +14,7 @@ from ..calibrate.curves import FittedCurve
 from ..calibrate.importance import LEAST_ESS, MOST_PARETO_K, MOST_RHAT
 from ..calibrate.judgement import CORRELATED_SHARE, LARGE_MISFIT
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
-from ..campaign.findings import worst
+from ..campaign.findings import has_error
 from ..discovery.sentences import NOTHING_MISSING, headline, verdict_in_words, within_noise
 from .read import CALIBRATION, DATA, Results
 
@@ -88,7 +88,7 @@ def check_results(results: Results, shown: Sequence[FittedCurve] = ()) -> list[C
         found.append(_data(results))
     if results.discovery is not None:
         found.append(_complete(results, results.discovery))
-    if worst(findings) == "error":
+    if has_error(findings):
         # Next to numbers that cannot be true nothing is fine: what would be is not judged.
         found = [replace(check, level="unknown") if check.level == "good" else check for check in found]
     return found

@@ -14,7 +14,7 @@ from .._version import __version__
 from ..calibrate.curves import KINDS, FittedCurve
 from ..calibrate.estimates import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
-from ..campaign.findings import worst
+from ..campaign.findings import has_error
 from ..discovery.sentences import headline, verdict_in_words
 from .read import Results
 
@@ -155,7 +155,7 @@ def _cards(results: Results, checks: list[Check]) -> list[tuple[str, str, str, s
         return found
     used = sum(entry["kept"] for entry in content["particles"])
     of = "" if results.law == "the law" else f" of {results.law}"
-    done, trusted = content["converged"], worst(tested(results)) != "error"
+    done, trusted = content["converged"], not has_error(tested(results))
     good, look, bad = ([f"“{c.check}”" for c in checks if c.level == one] for one in ("good", "look", "bad"))
     failed, conspicuous = len(checks) - len(good), listed([*bad, *look]) if bad or look else "nothing is conspicuous"
     count = f"{failed} of {len(checks)} fail" if failed else f"all {len(checks)} hold"

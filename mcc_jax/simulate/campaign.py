@@ -154,15 +154,7 @@ def paper_law(
     return MccLaw(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
 
 
-def draw_plastic(count: int, seed: int, *, shared: bool) -> Plastic:
-    """Coefficients of `count` particles, drawn from Table 2; `shared`: the mean law's for all."""
-    population = paper_population()
-    if shared:
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
-    return population.sample(jax.random.key(seed), count)
-
-
-def draw_evenly(between: Sequence[float] | np.ndarray, count: int, seed: int) -> Array:
+def draw_evenly(between: Sequence[float], count: int, seed: int) -> Array:
     """`count` numbers from a range, from another stream than those of coefficients and noise."""
     rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
     low, high = between
@@ -309,7 +301,6 @@ def paper_campaign(
     programme: Programme | None = None,
     unloading: Unloading | str = Unloading.PRINTED,
     strain_scaling: StrainScaling | str = StrainScaling.RAW,
-    peak_stress_MPa: Sequence[float] = PAPER_PEAK_STRESS_MPA,
     effects: Sequence[HiddenEffect] = (),
     relative_humidity_percent: Any = None,
 ) -> Campaign:
@@ -325,19 +316,17 @@ def paper_campaign(
         programme: what the instrument does; one cycle at 2 mN/s if None.
         unloading: form of the unloading law (16 GPa belongs to the printed one).
         strain_scaling: how the shape factor enters unloading.
-        peak_stress_MPa: range of the maximum stress.
         effects, relative_humidity_percent: as of `simulate_campaign`.
     """
     seed = arguments.seed(seed)
     programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme
     instrument = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05) if instrument is None else instrument
-    between = arguments.floats(peak_stress_MPa, "peak_stress_MPa", shape="two stresses [MPa], the smaller first")
-    if between.shape != (2,) or not (0 < between[0] <= between[1] < np.inf):
-        raise InputError(f"peak_stress_MPa must be two stresses > 0, the smaller first, got {between.tolist()}")
-    count = len(PAPER_DIAMETERS_UM)
-    plastic = draw_plastic(count, seed, shared=shared_material)
+    count, population = len(PAPER_DIAMETERS_UM), paper_population()
+    plastic = population.sample(jax.random.key(seed), count)
+    if shared_material:
+        plastic = jax.tree.map(lambda x: jnp.full(count, x), population.mean_law)
     laws = law_for_each(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
-    stress = draw_evenly(between, count, seed)
+    stress = draw_evenly(PAPER_PEAK_STRESS_MPA, count, seed)
     peaks = peaks_at_stress(laws, particle_batch(PAPER_DIAMETERS_UM), stress, programme.control)
     return simulate_campaign(
         laws,

@@ -93,7 +93,6 @@ class Programme:
         levels: Sequence[float] = (1.0,),
         unload_to: float = 0.0,
         hold_s: float = 0.0,
-        unload_rate: float | None = None,
         interval_s: float | None = None,
         points: int | None = None,
     ) -> Programme:
@@ -101,21 +100,19 @@ class Programme:
 
         Args:
             control: controlled quantity.
-            rate: loading rate [mN/s or um/s]; the paper's tests ran at 2 mN/s.
+            rate: of all ramps [mN/s or um/s]; the paper's tests ran at 2 mN/s.
             levels: shares of the particle's peak, one per cycle.
             unload_to: share of the peak at which reloading starts.
             hold_s: hold at every level.
-            unload_rate: rate of unloading; `rate` if None.
             interval_s, points: as of `Programme`; 300 points if neither is given.
         """
         levels = arguments.floats(levels, "levels", shape="a list of shares of the peak").ravel().tolist()
         hold_s = arguments.number(hold_s, "hold_s", least=0)
         unload_to = arguments.number(unload_to, "unload_to, a share of the peak,", least=0)
-        back = rate if unload_rate is None else unload_rate
         hold = [Hold(hold_s)] if hold_s else []
         steps: list[Ramp | Hold] = []
         for i, level in enumerate(levels, start=1):
-            steps += [Ramp(level, rate), *hold, Ramp(unload_to if i < len(levels) else 0.0, back)]
+            steps += [Ramp(level, rate), *hold, Ramp(unload_to if i < len(levels) else 0.0, rate)]
         if interval_s is None and points is None:
             points = 300
         return cls(control, steps, interval_s, points)

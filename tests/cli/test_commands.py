@@ -9,7 +9,7 @@ from asserting import done, snapshot
 from helpers import INSTRUMENTS
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
-from mcc_jax.cli.demo import NOTHING, SEALED, STRENGTHS, compared, seal_of, sealed_answer
+from mcc_jax.cli.demo import NOTHING, SEALED, STRENGTHS, compared, sealed_answer
 from mcc_jax.cli.main import cli
 from mcc_jax.cli.options import STRAIN_SCALING, UNLOADING
 from mcc_jax.law import StrainScaling, Unloading
@@ -111,7 +111,7 @@ def test_the_seal_fixes_what_is_hidden():
         assert low <= effect.strength <= high
         assert answer["parameters"][effect.variant.parameter] == effect.strength
         drawn.add(answer["mechanism"])
-        seals.add(seal_of(text))
+        seals.add(text)
     assert drawn == set(STRENGTHS)
     assert len(seals) == 30
 

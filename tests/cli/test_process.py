@@ -11,6 +11,8 @@ import time
 import pytest
 from asserting import snapshot
 
+from mcc_jax._store import WORK
+
 COMMAND = [sys.executable, "-m", "mcc_jax"]
 pytestmark = pytest.mark.extended  # processes that load the library for seconds each
 posix = pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -75,7 +77,7 @@ def test_full_disk(tmp_path):
     line = errors(result.stderr)
     assert line.count("\n") == 1
     assert str(tmp_path) in line
-    assert "work-" not in line
+    assert WORK not in line
     assert snapshot(tmp_path) == before
 
 
@@ -113,7 +115,7 @@ def test_killed_in_the_middle(tmp_path, number, status):
     command, pipe = [*COMMAND, "demo", "--out", out], subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         deadline = time.monotonic() + 60
-        while not list(out.glob(".mcc-jax-work-*/new")) and time.monotonic() < deadline:
+        while not (out / WORK / "campaign").exists() and time.monotonic() < deadline:
             time.sleep(0.02)
         process.send_signal(number)
         stdout, stderr = process.communicate(timeout=60)

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -81,15 +81,7 @@ def _behind(plan: list[Part], name: str, number: int) -> list[Part]:
 
 def _one_worker(run: Watched, plan: list[Part], shared: Path, here: np.ndarray) -> tuple[str | None, str]:
     """Watch one worker; what ended it, or None, and what it said of that."""
-    settings = {
-        "module": run.module,
-        "plan": plan,
-        "seed": run.seed,
-        "out": str(run.out.absolute()),
-        "shared": str(shared),
-        "seconds": run.seconds,
-        "double": run.double,
-    }
+    settings = asdict(run) | {"plan": plan, "out": str(run.out.absolute()), "shared": str(shared)}
     said = shared.with_name("said")
     with said.open("w+b") as stream:
         worker = subprocess.Popen(

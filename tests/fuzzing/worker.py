@@ -90,11 +90,11 @@ def _peak_MiB() -> float:
     return int(line.split()[1]) / 1024
 
 
-def work(module: str, plan: Sequence[Part], seed: int, out: Path, shared: Path, seconds: float) -> None:
+def work(*, module: str, plan: Sequence[Part], seed: int, out: str, shared: str, seconds: float) -> None:
     """Go through the plan: reader, first number, number behind the last."""
     readers = {reader.name: (i, reader) for i, reader in enumerate(importlib.import_module(module).READERS)}
-    here, table = progress_of(shared, len(readers), "r+")
-    folder = shared.parent / "work" / "case"
+    here, table = progress_of(Path(shared), len(readers), "r+")
+    folder = Path(shared).parent / "work" / "case"
     with Path("/proc/self/statm").open("rb", buffering=0) as statm:
         for name, first, stop in plan:
             place, reader = readers[name]
@@ -121,7 +121,7 @@ def work(module: str, plan: Sequence[Part], seed: int, out: Path, shared: Path, 
                 row[4] = max(row[4], 1e3 * took)
                 row[6] += took
                 if kind not in ("refused", "read"):
-                    keep(out, reader, seed, number, kind, text)
+                    keep(Path(out), reader, seed, number, kind, text)
                 if number % 64 == 0 or number == stop - 1:
                     row[5] = max(row[5], _peak_MiB())
 
@@ -141,15 +141,8 @@ if __name__ == "__main__":
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     warnings.simplefilter("error")
     settings = json.loads(sys.argv[1])
-    if settings["double"]:
+    if settings.pop("double"):
         import jax
 
         jax.config.update("jax_enable_x64", True)
-    work(
-        settings["module"],
-        settings["plan"],
-        settings["seed"],
-        Path(settings["out"]),
-        Path(settings["shared"]),
-        settings["seconds"],
-    )
+    work(**settings)

@@ -10,14 +10,12 @@ from mcc_jax.simulate import read_programme
 
 
 def test_levels_holds_and_partial_unloads_are_all_reached():
-    programme = Programme.cycles(
-        rate=4.0, levels=(0.5, 1.0), unload_to=0.1, hold_s=10.0, unload_rate=8.0, interval_s=1.0
-    )
+    programme = Programme.cycles(rate=4.0, levels=(0.5, 1.0), unload_to=0.1, hold_s=10.0, interval_s=1.0)
     time, force = programme.sample(80.0)
-    turning = {0.0: 0.0, 10.0: 40.0, 20.0: 40.0, 24.0: 8.0, 42.0: 80.0, 52.0: 80.0, 62.0: 0.0}
+    turning = {0.0: 0.0, 10.0: 40.0, 20.0: 40.0, 28.0: 8.0, 46.0: 80.0, 56.0: 80.0, 76.0: 0.0}
     for t, f in turning.items():
         assert force[np.argmin(np.abs(time - t))] == pytest.approx(f)
-    assert time[-1] == pytest.approx(62.0)
+    assert time[-1] == pytest.approx(76.0)
 
 
 steps = st.lists(
