@@ -16,23 +16,10 @@ from .._errors import InputError
 from .._format import first_few
 from .._store import results
 from ..files import TABLE_BYTES, read_regular
+from . import tables
 from .metadata import format_metadata, parse_metadata, read_settings
 from .schema import CHANNELS, SMALLEST_DIAMETER_UM, Campaign, Curve, check_campaign, fault_of
-from .table import (
-    DIMENSIONS,
-    LARGEST_MAGNITUDE,
-    Table,
-    convert,
-    decode,
-    find_column,
-    make_table,
-    missing_column,
-    parse_table,
-    read_bytes,
-    read_table,
-    same_text,
-)
-from .workbook import is_workbook, read_sheet
+from .tables import Table
 
 PARTICLES, CURVES, METADATA = "particles.csv", "curves.csv", "campaign.toml"
 _DIAMETERS = {"D1": "length", "D2": "length", "D3": "length"}
@@ -46,7 +33,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     """
     path = arguments.file_path(folder, "folder")
     _check_folder(path)
-    table = read_table(path / PARTICLES)
+    table = tables.read_table(path / PARTICLES)
     names, diameters, columns = parse_particles(table)
     curves = _read_curves(path / CURVES, names, table)
     toml = path / METADATA
@@ -84,11 +71,11 @@ def read_particles(
     `InputError` names file and row.
     """
     path = arguments.file_path(file, "file")
-    data = read_bytes(path)
-    if is_workbook(data):
-        cells = read_sheet(data, path, preferred=Path(PARTICLES).stem)
-        return parse_particles(make_table(cells, range(1, len(cells) + 1), path), named)
-    return parse_particles(parse_table(decode(data, path), path), named)
+    data = tables.read_bytes(path)
+    if tables.is_workbook(data):
+        cells = tables.read_sheet(data, path, preferred=Path(PARTICLES).stem)
+        return parse_particles(tables.make_table(cells, range(1, len(cells) + 1), path), named)
+    return parse_particles(tables.parse_table(tables.decode(data, path), path), named)
 
 
 def parse_particles(
@@ -107,7 +94,7 @@ def parse_particles(
         seen[name] = i
     diameters = _measured(table, _DIAMETERS)
     for column, values in diameters.items():
-        bad = np.flatnonzero(~((values >= SMALLEST_DIAMETER_UM) & (values <= LARGEST_MAGNITUDE)))
+        bad = np.flatnonzero(~((values >= SMALLEST_DIAMETER_UM) & (values <= tables.LARGEST_MAGNITUDE)))
         if bad.size:
             value = values[bad[0]]
             what = "not positive" if value <= 0 else f"too {'small' if value < 1 else 'large'} to be real"
@@ -122,23 +109,24 @@ def _name_column(table: Table, allowed: Sequence[str] = ("particle",)) -> int:
     for name in allowed:
         if name in table.header:
             return table.header.index(name)
-    raise missing_column(table.header, allowed[0], table.file)
+    raise tables.missing_column(table.header, allowed[0], table.file)
 
 
 def _measured(table: Table, quantities: Mapping[str, str]) -> dict[int, np.ndarray]:
     """The columns of some quantities in mN, um or s, by their place in the table."""
-    factors = dict(find_column(table.header, name, dimension, table.file) for name, dimension in quantities.items())
+    header, file = table.header, table.file
+    factors = dict(tables.find_column(header, name, dimension, file) for name, dimension in quantities.items())
     if quantities is _DIAMETERS or table.delimiter != ",":
         table.refuse_groups(list(factors))
     raw = table.numbers(list(factors))
-    return {i: convert(values, factor) for (i, factor), values in zip(factors.items(), raw, strict=True)}
+    return {i: tables.convert(values, factor) for (i, factor), values in zip(factors.items(), raw, strict=True)}
 
 
 def _read_curves(file: Path, particles: Sequence[str], sizes: Table) -> tuple[Curve, ...]:
     """The tests of the particles, in their order, each of its rows in the file's order."""
-    table = read_table(file, names="particle")
+    table = tables.read_table(file, names="particle")
     where = _name_column(table)
-    channels = _measured(table, DIMENSIONS)
+    channels = _measured(table, tables.DIMENSIONS)
     for i, name in enumerate(table.header):
         if i != where and i not in channels:
             remedy = f"Keep particle, time, force and displacement; facts about a particle belong in {PARTICLES}"
@@ -157,7 +145,7 @@ def _read_curves(file: Path, particles: Sequence[str], sizes: Table) -> tuple[Cu
         at = rows[name]
         curve = Curve(time[at], force[at], displacement[at])
         if (fault := fault_of(name, curve)) is not None:
-            column = dict(zip(DIMENSIONS, channels, strict=True)).get(fault.channel, where)
+            column = dict(zip(tables.DIMENSIONS, channels, strict=True)).get(fault.channel, where)
             raise table.wrong(fault.problem, at[fault.reading], column, fault.remedy)
         curves.append(curve)
     return tuple(curves)
@@ -168,8 +156,8 @@ def _rows_of(names: Sequence[str] | np.ndarray, particles: Sequence[str]) -> Map
     import pandas as pd
 
     codes, written = pd.factorize(np.array(names, object))
-    form = {same_text(name): name for name in reversed(particles)} | {name: name for name in particles}
-    known = [form.get(name, form.get(same_text(name), name)) for name in map(str, written)]
+    form = {tables.same_text(name): name for name in reversed(particles)} | {name: name for name in particles}
+    known = [form.get(name, form.get(tables.same_text(name), name)) for name in map(str, written)]
     places = {name: place for place, name in enumerate(dict.fromkeys(known))}
     which = np.array([places[name] for name in known])[codes]
     records = np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])

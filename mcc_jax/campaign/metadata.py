@@ -20,7 +20,7 @@ from .. import arguments
 from .._errors import InputError
 from ..files import SETTINGS_BYTES, read_regular
 from .schema import Control, Metadata
-from .table import CANONICAL, convert, decode, find_column
+from .tables import CANONICAL, convert, decode, find_column
 
 _QUANTITIES = {"force_resolution": "force", "displacement_resolution": "length", "punch_diameter": "length"}
 _WRITE = {

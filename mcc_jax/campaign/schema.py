@@ -15,7 +15,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described, number, span, table
 from .findings import Finding
-from .table import LARGEST_MAGNITUDE
+from .tables import LARGEST_MAGNITUDE
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,7 +22,6 @@ from .session import provenance, session, write_result
 
 if TYPE_CHECKING:
     from .._types import Progress
-    from ..campaign import Campaign
     from ..simulate import HiddenEffect
 
 SEALED = "sealed.json"
@@ -105,13 +104,20 @@ def _job(
     stage: Stage, effect: HiddenEffect, settings: dict[str, Any], progress: Progress
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Simulate, calibrate, discover, report; the contents of the two results."""
+    import numpy as np
+
     from ..calibrate import sample
     from ..campaign.csv import write_files
     from ..discovery import discover
     from ..report import read_results, report_page
+    from ..simulate import Programme, paper_campaign
 
     progress("simulating the campaign")
-    campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
+    seed = settings["seed"]
+    programme = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=20.0, points=150)
+    made = paper_campaign(seed, programme=programme, effects=(effect,)).select(np.arange(20) < PARTICLES)
+    # Whatever gives the truth is taken out.
+    campaign = dataclasses.replace(made, columns={}, metadata=dataclasses.replace(made.metadata, other={}))
     write_files(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, folder="campaign")
     written: dict[str, Any] = {"origin": origin, "figures": True, "progress": progress}
@@ -121,18 +127,6 @@ def _job(
     page = report_page(read_results(stage.folder, name=stage.directory.resolve().name), progress=progress)
     (stage.folder / REPORT).write_text(page, encoding="utf-8")
     return content, missing
-
-
-def _campaign(seed: int, effect: HiddenEffect) -> Campaign:
-    """Eight of the paper's particles, tested in the computer; whatever gives the truth is taken out."""
-    import numpy as np
-
-    from ..simulate import Programme, paper_campaign
-
-    programme = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=20.0, points=150)
-    made = paper_campaign(seed, programme=programme, effects=(effect,))
-    some = made.select(np.arange(len(made)) < PARTICLES)
-    return dataclasses.replace(some, columns={}, metadata=dataclasses.replace(some.metadata, other={}))
 
 
 def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:

@@ -167,10 +167,14 @@ def _particles(file: Path | None) -> tuple[Any, Any, Any]:
 
 
 def _simulated(particles: tuple[Any, Any, Any], hidden: Sequence[HiddenEffect], options: Mapping[str, Any]) -> Campaign:
-    """The campaign, with the further columns of the particles' table."""
+    """The campaign, of coefficients fixed or drawn, with the further columns of the particles' table."""
+    import equinox as eqx
+    import jax
+
     from ..campaign import check_campaign
     from ..campaign.record import humidity_column
-    from ..simulate import Instrument, Programme, read_programme, simulate_campaign
+    from ..law import Plastic
+    from ..simulate import Instrument, Programme, law_for_each, paper_population, read_programme, simulate_campaign
 
     names, diameters_um, columns = particles
     file, seed = options["programme"], options["seed"]
@@ -184,7 +188,11 @@ def _simulated(particles: tuple[Any, Any, Any], hidden: Sequence[HiddenEffect], 
     if not least > 0:
         problem = f"--a {options['a']:g} gives a particle the shape factor {least:.4g}"
         raise InputError(problem, file=options["particles"], remedy="Give an --a nearer to zero")
-    laws = _laws(len(names), options)
+    drawn = paper_population().sample(jax.random.key(seed), len(names))
+    fixed = {name: jax.numpy.full(len(names), options[name]) for name in COEFFICIENTS if options[name] is not None}
+    plastic = eqx.filter_vmap(Plastic)(*(fixed.get(name, getattr(drawn, name)) for name in COEFFICIENTS))
+    form = options["unloading"], options["strain_scaling"]
+    laws = law_for_each(plastic, options["a"], options["effective_modulus"], *form)
     peaks = _peaks(laws, diameters_um, programme, options)
     instrument = Instrument(**{field.name: options[field.name] for field in dataclasses.fields(Instrument)})
     humidity = humidity_column(names, columns, str(options["particles"] or "")) if hidden else None
@@ -206,21 +214,6 @@ def _simulated(particles: tuple[Any, Any, Any], hidden: Sequence[HiddenEffect], 
         return check_campaign(campaign)
     except InputError as error:
         raise error.changed(file=file or options["particles"], remedy="Choose less extreme values") from error
-
-
-def _laws(count: int, options: Mapping[str, Any]) -> MccLaw:
-    """One law per particle, of fixed or drawn coefficients."""
-    import equinox as eqx
-    import jax
-
-    from ..law import Plastic
-    from ..simulate import law_for_each, paper_population
-
-    drawn = paper_population().sample(jax.random.key(options["seed"]), count)
-    fixed = {name: jax.numpy.full(count, options[name]) for name in COEFFICIENTS if options[name] is not None}
-    plastic = eqx.filter_vmap(Plastic)(*(fixed.get(name, getattr(drawn, name)) for name in COEFFICIENTS))
-    form = options["unloading"], options["strain_scaling"]
-    return law_for_each(plastic, options["a"], options["effective_modulus"], *form)
 
 
 def _peaks(laws: MccLaw, diameters_um: np.ndarray, programme: Programme, options: Mapping[str, Any]) -> np.ndarray:

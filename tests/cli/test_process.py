@@ -102,10 +102,7 @@ SEAL = r"[^\n]*sealed, SHA-256:\n  [0-9a-f]{64}\n"
 
 @posix
 @pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize(
-    ("number", "status"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)],
-)
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_killed_in_the_middle(tmp_path, number, status):
     out = tmp_path / "out"
     (out / "campaign").mkdir(parents=True)

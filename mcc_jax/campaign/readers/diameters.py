@@ -12,7 +12,7 @@ from ... import arguments
 from ..._errors import InputError
 from ..._format import first_few
 from ..csv import read_particles
-from ..table import parse_number, same_text
+from ..tables import parse_number, same_text
 
 Triple = Sequence[float | int] | np.ndarray
 Diameters = Mapping[str, Triple] | Triple

@@ -20,7 +20,7 @@ from ..._errors import InputError
 from ..._format import counted, first_few
 from ..findings import Finding
 from ..schema import Control
-from ..table import read_bytes, same_text
+from ..tables import read_bytes, same_text
 from .text import Tests
 
 NO_DATA = frozenset(

@@ -14,22 +14,8 @@ import numpy as np
 
 from ..._errors import InputError
 from ..._format import counted
+from .. import tables
 from ..schema import Curve, fault_of
-from ..table import (
-    APOSTROPHES,
-    DIMENSIONS,
-    LARGEST_MAGNITUDE,
-    binary_kind,
-    convert,
-    filled,
-    parse_number,
-    same_text,
-    split,
-    thousands_for_decimals,
-    thousands_mark,
-    unit_factor,
-)
-from ..workbook import is_workbook, read_sheet
 from .mapping import MappingFile
 from .text import Tests, decode_lines
 
@@ -62,14 +48,14 @@ class _Rows:
         self.file, self.mapping, self.delimiter = file, mapping.file.name, mapping.delimiter
         self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
         self.rows: list[str] | list[list[str]]
-        if is_workbook(data):
+        if tables.is_workbook(data):
             how = f'Write sheet = "..." in {mapping.file.name}'
-            self.rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
+            self.rows = tables.read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
             return
         if mapping.sheet is not None:
             problem = f"is no Excel workbook (xlsx), though {mapping.file.name} names a sheet"
             raise InputError(problem, file=file, remedy="Remove the key sheet, or save the file as xlsx")
-        kind = binary_kind(data)
+        kind = tables.binary_kind(data)
         if kind is not None and not mapping.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32")):
             remedy = "Unpack it, save it as xlsx or text, or name its encoding"
             raise InputError(f"the file is {kind}", file=file, remedy=remedy)
@@ -88,7 +74,7 @@ class _Rows:
         """Whether a row, or the first thing that it holds, begins with a text, if there is one."""
         if text is None:
             return False
-        line, text = same_text(self.line(i).lstrip()), same_text(text)
+        line, text = tables.same_text(self.line(i).lstrip()), tables.same_text(text)
         return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
 
     def cells(self, i: int) -> list[str]:
@@ -100,7 +86,7 @@ class _Rows:
         if '"' not in row:
             return row.split(self.delimiter)
         try:
-            return split(row, self.file, self.delimiter)[0][0]
+            return tables.split(row, self.file, self.delimiter)[0][0]
         except InputError as error:
             remedy = f"Close every double quote, or correct delimiter in {self.mapping}"
             raise error.changed(row=i + 1, remedy=remedy) from None
@@ -141,13 +127,13 @@ class _Reader:
         full = [i, *(j for j in range(i, self.count) if not rows.blank(j))]
         self.stop = full[max(-mapping.skip_footer, -len(full))] if mapping.skip_footer else self.count
         self.where = {name: self._place(source.column, head) for name, source in mapping.sources.items()}
-        self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
+        self.wanted = [quantity for quantity in tables.DIMENSIONS if quantity in self.where]
         first = self.header
         if first is None:
             first = next((rows.cells(j) for j in range(head, self.stop) if not rows.blank(j)), [])
         needed = max(self.where.values()) + 1
         # The cells that a row must have: without and with what is empty behind the last column.
-        self.width, self.raw_width = max(needed, filled(first)), max(needed, len(first))
+        self.width, self.raw_width = max(needed, tables.filled(first)), max(needed, len(first))
         sizes = self._diameters(0, head)
         block, ended = 1, False
         while i < self.stop:
@@ -175,8 +161,8 @@ class _Reader:
     def _take(self, i: int, readings: list[_Reading], block: int, sizes: list[float] | InputError | None) -> None:
         """Keep a row of data, of the test of this number where the file does not name it, with its diameters."""
         cells = self.rows.cells(i)
-        if len(cells) != self.raw_width and not (len(cells) >= self.width >= filled(cells)):
-            count = len(cells) if len(cells) < self.width else filled(cells)
+        if len(cells) != self.raw_width and not (len(cells) >= self.width >= tables.filled(cells)):
+            count = len(cells) if len(cells) < self.width else tables.filled(cells)
             remedy = "Fill the row or delete it; if the file was cut off here, export it again"
             if count > self.width:
                 remedy = f"Check delimiter and decimal_mark in {self.mapping.file.name}, and quote text that holds the "
@@ -208,7 +194,7 @@ class _Reader:
                 raise self.wrong(f"there is no column {column}, only {len(self.header)}", "Count again", head)
             return column - 1
         names = _names(self.header or [])
-        found = [i for i, name in enumerate(names) if name == same_text(column)]
+        found = [i for i, name in enumerate(names) if name == tables.same_text(column)]
         if len(found) == 1:
             return found[0]
         if found:
@@ -267,22 +253,22 @@ class _Reader:
         for mark in self.mapping.missing or ():
             texts.add(str(mark).strip().lower())  # TOML has a number nan, which equals nothing, itself included
             with contextlib.suppress(ValueError):
-                numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
+                numbers.add(tables.parse_number(mark) if isinstance(mark, str) else mark)
         return texts, numbers
 
     def _number(self, cell: str) -> float:
-        return parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
+        return tables.parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
 
     def _number_remedy(self, cells: list[str], cell: str) -> str:
         """What to do about a cell of a row that is no number, by what it looks like."""
-        name, mark = self.mapping.file.name, thousands_mark(cell, self.mapping.decimal_mark)
+        name, mark = self.mapping.file.name, tables.thousands_mark(cell, self.mapping.decimal_mark)
         if _CLOCK.fullmatch(cell):
             return (
                 "Write times as numbers, not as dates or hours and minutes (in a spreadsheet: the cells' number format "
                 f'"General", and unit = "day" in {name})'
             )
         if mark is not None and not self.mapping.thousands:
-            word = {".": "point", ",": "comma"}.get(mark, "apostrophe" if mark in APOSTROPHES else "space")
+            word = {".": "point", ",": "comma"}.get(mark, "apostrophe" if mark in tables.APOSTROPHES else "space")
             other = ' (or decimal_mark = ",")' if mark == "," and cell.count(",") == 1 and "." not in cell else ""
             return f'If the mark separates thousands, write thousands = "{word}"{other} in {name}'
         if _is_no_reading(cell):
@@ -307,13 +293,13 @@ class _Reader:
             case "blank line" | "header":
                 return str(block)
             case "column":
-                name = same_text(cells[self.where["test"]].strip())
+                name = tables.same_text(cells[self.where["test"]].strip())
                 if not name:
                     column = self.mapping.sources["test"].column
                     raise self.wrong("the test's name is empty", "Fill the cell, or remove the row", i, column)
                 return name
             case "file":
-                return same_text(self.mapping.test_name or self.file.stem)
+                return tables.same_text(self.mapping.test_name or self.file.stem)
 
     def _diameters(self, start: int, stop: int) -> list[float] | InputError | None:
         """D1, D2, D3 [um] as the rows from `start` to `stop` hold them, or why not: a table may hold them."""
@@ -330,7 +316,7 @@ class _Reader:
         for i in range(start, stop):
             if not self.rows.begins(i, name):
                 continue
-            rest = same_text(" ".join(cell.strip() for cell in self.rows.cells(i) if cell.strip()))[len(name) :]
+            rest = tables.same_text(" ".join(cell.strip() for cell in self.rows.cells(i) if cell.strip()))[len(name) :]
             if rest[:1].isalnum():
                 continue
             words = rest.replace(":", " ").replace("=", " ").split()
@@ -341,13 +327,13 @@ class _Reader:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise self.wrong(problem, _OWN_DIAMETER, i)
             try:
-                factor = unit_factor("".join(units[:1]) if unit is None else unit, "length")
+                factor = tables.unit_factor("".join(units[:1]) if unit is None else unit, "length")
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
                 raise self.wrong(str(error), remedy, i, name) from None
             if not numbers[0] > 0:
                 raise self.wrong(f"the diameter {numbers[0]:g} is not positive", _OWN_DIAMETER, i, name)
-            return float(convert(np.array(numbers), factor)[0])
+            return float(tables.convert(np.array(numbers), factor)[0])
         raise self.wrong(f"no row above the samples begins with {name!r}, for the diameter", _OWN_DIAMETER)
 
     # ---- tests -------------------------------------------------------------------------------------------------------
@@ -359,7 +345,7 @@ class _Reader:
         mark = self.mapping.decimal_mark
         taken = [i for samples in self.samples.values() for i, _, _ in samples]
         for quantity in self.wanted:
-            found = thousands_for_decimals([self.rows.cells(i)[self.where[quantity]] for i in taken], mark)
+            found = tables.thousands_for_decimals([self.rows.cells(i)[self.where[quantity]] for i in taken], mark)
             if found is not None:
                 word, other = ("point", ",") if mark == "." else ("comma", ".")
                 remedy = (
@@ -373,7 +359,7 @@ class _Reader:
         mapping, samples = self.mapping, self.samples[name]
         raw = np.array([readings for _, _, readings in samples], float).T
         columns = {
-            quantity: mapping.sources[quantity].sign * convert(values.copy(), mapping.sources[quantity].factor)
+            quantity: mapping.sources[quantity].sign * tables.convert(values.copy(), mapping.sources[quantity].factor)
             for quantity, values in zip(self.wanted, raw, strict=True)
         }
         if mapping.pace is not None:
@@ -393,7 +379,7 @@ _CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2
 
 
 def _names(header: list[str]) -> list[str]:
-    return [same_text(name).strip() for name in header]
+    return [tables.same_text(name).strip() for name in header]
 
 
 def _is_no_reading(cell: str) -> bool:
@@ -401,6 +387,6 @@ def _is_no_reading(cell: str) -> bool:
     if not any(c.isalnum() for c in cell) or cell.lower().strip("+-#") in ("nan", "inf", "na", "n/a", "null", "none"):
         return True
     try:
-        return abs(float(cell.replace(",", "."))) > LARGEST_MAGNITUDE
+        return abs(float(cell.replace(",", "."))) > tables.LARGEST_MAGNITUDE
     except ValueError:
         return False

@@ -20,7 +20,7 @@ from ..._errors import InputError
 from ..metadata import load_toml_file, typed
 from ..schema import Control
 from ..signal import turning_points
-from ..table import APOSTROPHES, DIMENSIONS, EXAMPLES, SPACES, same_text, unit_factor
+from ..tables import APOSTROPHES, DIMENSIONS, EXAMPLES, SPACES, same_text, unit_factor
 from .diameters import Diameters
 
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}

@@ -13,7 +13,7 @@ from pathlib import Path
 from ..._errors import InputError
 from ...files import UNPACKED_BYTES
 from ..schema import Curve
-from ..table import filled
+from ..tables import filled
 from .text import Tests, checked_curve, decode_lines, number_block
 
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")

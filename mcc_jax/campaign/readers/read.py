@@ -12,8 +12,7 @@ from ..._errors import InputError
 from ..._format import counted
 from ..findings import Finding
 from ..schema import CHANNELS, Campaign, Metadata, check_campaign
-from ..table import binary_kind, read_bytes
-from ..workbook import is_workbook
+from ..tables import binary_kind, is_workbook, read_bytes
 from . import fischer, hysitron, micromaterials
 from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder

@@ -13,7 +13,7 @@ import numpy as np
 from ..._errors import InputError
 from ..._format import counted
 from ..schema import Control, Curve, fault_of
-from ..table import Table, check_header
+from ..tables import Table, check_header
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 
