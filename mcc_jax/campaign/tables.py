@@ -6,7 +6,6 @@ separator. A delimiter after the last cell of a row, and rows of delimiters only
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import math
@@ -92,28 +91,12 @@ def same_text(text: str) -> str:
 _LARGEST_NUMBER = LARGEST_MAGNITUDE * 1e12  # in any unit
 
 
-def plain_numbers(cells: Sequence[str], decimal_mark: str) -> np.ndarray | None:
-    """The numbers of a column's cells, several times as fast as by `parse_number`; None if some cell is not plain."""
-    text = "\n".join(cells)
-    if text.isascii() and "_" not in text and (decimal_mark == "." or "." not in text):
-        with contextlib.suppress(ValueError):
-            values = np.array([float(cell.replace(decimal_mark, ".")) for cell in cells])
-            if (np.abs(values) <= _LARGEST_NUMBER).all():
-                return values
-    return None
-
-
 def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> float:
     """A cell's number, or a `ValueError` that says why there is none; each of the characters `thousands` may separate
     groups of three digits."""
-    text = cell.strip()
-    if not text:
-        raise ValueError("the cell is empty")
-    shown = repr(text if len(text) <= 40 else f"{text[:40]}...")
-    plain = text
-    if any(mark in text for mark in thousands):
-        if _grouped(thousands, decimal_mark).fullmatch(text) is None:
-            raise ValueError(f"{shown} is not a number with groups of three digits")
+    text = plain = cell.strip()
+    in_groups = bool(thousands) and any(mark in text for mark in thousands)
+    if in_groups and _grouped(thousands, decimal_mark).fullmatch(text):
         plain = re.sub(f"[{re.escape(thousands)}]", "", text)
     # Python also reads 1_000 and digits of other scripts; in a data file both are mistakes.
     odd = not plain.isascii() or "_" in plain or (decimal_mark != "." and "." in plain)
@@ -121,16 +104,20 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
         number = None if odd else float(plain.replace(decimal_mark, "."))
     except ValueError:
         number = None
-    if number is None:
-        hint = " (a decimal comma?)" if decimal_mark == "." and text.count(",") == 1 else ""
-        if thousands_mark(text, decimal_mark) and (not hint or "." in text):
-            hint = " (a mark between the thousands?)"
-        raise ValueError(f"{shown} is not a number{hint}")
-    if not math.isfinite(number):
-        raise ValueError(f"{shown} is not a finite number")
-    if abs(number) > _LARGEST_NUMBER:
-        raise ValueError(f"{shown} is too large to be a measurement")
-    return number
+    if number is not None and abs(number) <= _LARGEST_NUMBER:
+        return number
+    if not text:
+        raise ValueError("the cell is empty")
+    shown = repr(text if len(text) <= 40 else f"{text[:40]}...")
+    if number is not None:
+        what = "too large to be a measurement" if math.isfinite(number) else "not a finite number"
+        raise ValueError(f"{shown} is {what}")
+    if in_groups:
+        raise ValueError(f"{shown} is not a number with groups of three digits")
+    hint = " (a decimal comma?)" if decimal_mark == "." and text.count(",") == 1 else ""
+    if thousands_mark(text, decimal_mark) and (not hint or "." in text):
+        hint = " (a mark between the thousands?)"
+    raise ValueError(f"{shown} is not a number{hint}")
 
 
 @cache
@@ -218,15 +205,13 @@ class Table:
         point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
         found = []
         for i in columns:
-            values = plain_numbers(self.columns[i], mark)  # type: ignore[arg-type]
-            if values is None:
-                values = np.empty(len(self.rows))
-                for record, cell in enumerate(self.columns[i]):
-                    try:
-                        values[record] = parse_number(cell, mark)  # type: ignore[arg-type]
-                    except ValueError as error:
-                        remedy = remedy or f"Write a number with {point}, or remove the row"
-                        raise self.wrong(str(error), record, i, remedy) from None
+            values = np.empty(len(self.rows))
+            for record, cell in enumerate(self.columns[i]):
+                try:
+                    values[record] = parse_number(cell, mark)  # type: ignore[arg-type]
+                except ValueError as error:
+                    remedy = remedy or f"Write a number with {point}, or remove the row"
+                    raise self.wrong(str(error), record, i, remedy) from None
             found.append(values)
         return found
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .signal import differences, median, point_noise
+from .signal import differences, median
 
 CONTACT = 0.005  # share of the peak force that is contact: cellulose takes a quarter of its displacement below 3 %
 CONTACT_NOISE = 4.0  # the same in standard deviations of the force's noise, where that is more
@@ -92,9 +92,14 @@ def _without_spikes(values: np.ndarray) -> np.ndarray:
     return out
 
 
+def _noise(values: np.ndarray) -> float:
+    """Standard deviation of white noise on a smooth course: its second differences have 6 times the variance."""
+    return 0.0 if len(values) < 8 else 1.4826 * median(np.abs(differences(values, 2))) / np.sqrt(6.0)
+
+
 def _contact(rise: np.ndarray) -> tuple[int, float]:
     """The last sample before the force first rises for good, and the force there; later unloadings do not count."""
-    noise = point_noise(rise)
+    noise = _noise(rise)
     base = float(rise.min()) + 2 * noise  # the least of some hundred readings lies about two deviations below
     level = max(CONTACT * (float(rise[-1]) - base), CONTACT_NOISE * noise)
     first_rise = int(np.argmax(rise - base >= LOADED * level))
@@ -121,7 +126,7 @@ def _unloading_slope(load: np.ndarray, depth: np.ndarray) -> float:
     deep = np.flatnonzero(load[first:] < end)
     last = first + int(deep[0] if len(deep) else np.argmin(load[first:]))
     fall, back = float(load[first] - load[last]), float(depth[first] - depth[last])
-    if last - first < 3 or fall < 0.1 * load[0] or back <= 3 * point_noise(depth):
+    if last - first < 3 or fall < 0.1 * load[0] or back <= 3 * _noise(depth):
         return np.nan
     return fall / back
 
