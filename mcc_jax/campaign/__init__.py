@@ -18,7 +18,6 @@ from .findings import Finding as Finding
 from .metadata import load_toml_file as load_toml_file
 from .paper import PAPER_DIAMETERS_UM as PAPER_DIAMETERS_UM
 from .paper import PAPER_EFFECTIVE_MODULUS_MPA as PAPER_EFFECTIVE_MODULUS_MPA
-from .paper import PAPER_LOAD_RATE_MN_PER_S as PAPER_LOAD_RATE_MN_PER_S
 from .paper import PAPER_LOG_C as PAPER_LOG_C
 from .paper import PAPER_SHAPE_PARAMETER as PAPER_SHAPE_PARAMETER
 from .plausibility import check_plausibility as check_plausibility

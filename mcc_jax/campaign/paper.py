@@ -42,6 +42,3 @@ PAPER_SHAPE_PARAMETER = 1.43
 
 PAPER_EFFECTIVE_MODULUS_MPA = 16_000.0
 """Effective modulus [MPa]; it belongs to the printed unloading form only (Bommireddy et al. 2018, section 6)."""
-
-PAPER_LOAD_RATE_MN_PER_S = 2.0
-"""The tests' rate [mN/s]; the paper calls it a stress rate, but its unit and the instrument say force."""

@@ -20,7 +20,6 @@ from .._types import ScalarLike
 from ..campaign import (
     PAPER_DIAMETERS_UM,
     PAPER_EFFECTIVE_MODULUS_MPA,
-    PAPER_LOAD_RATE_MN_PER_S,
     PAPER_LOG_C,
     PAPER_SHAPE_PARAMETER,
     Campaign,
@@ -319,7 +318,7 @@ def paper_campaign(
         effects, relative_humidity_percent: as of `simulate_campaign`.
     """
     seed = arguments.seed(seed)
-    programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme
+    programme = Programme.cycles() if programme is None else programme
     instrument = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05) if instrument is None else instrument
     count, population = len(PAPER_DIAMETERS_UM), paper_population()
     plastic = population.sample(jax.random.key(seed), count)

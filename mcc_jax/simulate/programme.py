@@ -100,7 +100,7 @@ class Programme:
 
         Args:
             control: controlled quantity.
-            rate: of all ramps [mN/s or um/s]; the paper's tests ran at 2 mN/s.
+            rate: of all ramps [mN/s or um/s]; the paper's tests ran at 2 mN/s, which it calls a stress rate.
             levels: shares of the particle's peak, one per cycle.
             unload_to: share of the peak at which reloading starts.
             hold_s: hold at every level.
