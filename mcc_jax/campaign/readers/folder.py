@@ -83,7 +83,12 @@ def read_folder(
             findings.append(Finding("duplicates", "warning", sentence, remedy, tuple(same_text(f.stem) for f in alike)))
     form = f"{counted(len(files), 'file')}, {' and '.join(sorted({tests.format for tests in found.values()}))}"
     controls: set[Control | None] = {tests.control for tests in found.values()}
-    whole = Tests({}, form, controls.pop() if len(controls) == 1 else None, _other(found))
+    # What the files say besides the curves: once if all say the same, else by file.
+    each = {file.name: _short(tests.other) for file, tests in found.items()}
+    first, *others = each.values()
+    agree = all(said == first for said in others)
+    other = first if agree else {"files": {name: said for name, said in each.items() if said}}
+    whole = Tests({}, form, controls.pop() if len(controls) == 1 else None, other)
     own = Counter(name for tests in found.values() for name in tests.curves)
     keys: dict[str, tuple[str, ...]] = {}
     origin: dict[str, Path] = {}
@@ -152,15 +157,8 @@ def _or_leave_out(error: InputError, files: Sequence[Path]) -> InputError:
     return error.changed(remedy=f"{(error.remedy or 'Correct it').rstrip('.')}, or leave it out with {options}")
 
 
-def _other(found: dict[Path, Tests]) -> dict[str, Any]:
-    """What the files say besides the curves, without long lists: once if all say the same, else by file."""
-    each = {file.name: _short(tests.other) for file, tests in found.items()}
-    first = next(iter(each.values()))
-    said = {name: other for name, other in each.items() if other}
-    return first if all(other == first for other in each.values()) else {"files": said}
-
-
 def _short(value: Any) -> Any:
+    """What a file says, without long lists."""
     if not isinstance(value, dict):
         return value
     kept = {key: _short(item) for key, item in value.items()}

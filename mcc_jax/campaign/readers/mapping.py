@@ -21,7 +21,6 @@ from ..metadata import load_toml_file, typed
 from ..schema import Control
 from ..signal import turning_points
 from ..tables import APOSTROPHES, DIMENSIONS, EXAMPLES, SPACES, same_text, unit_factor
-from .diameters import Diameters
 
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 _THOUSANDS = {"none": "", "point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES} | {
@@ -205,12 +204,6 @@ class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
                 factor = _factor(entry.unit, DIMENSIONS[name], f"columns.{name}")
                 found[name] = Source(entry.column, factor, entry.sign)
         return found
-
-    @property
-    def sizes_um(self) -> Diameters | None:
-        """D1, D2, D3 [um] of all tests, or of each by its name."""
-        given = self.diameters_um
-        return given["all"] if given is not None and list(given) == ["all"] else given
 
 
 WRITE = {

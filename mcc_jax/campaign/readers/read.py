@@ -61,7 +61,8 @@ def read_instrument_file(
         if place.is_dir() and one.test_name is not None:
             problem = "is for one file, not for a folder"
             raise InputError(problem, file=one.file, column="test_name", remedy="Remove it")
-        diameters_um = one.sizes_um if diameters_um is None else diameters_um
+        if diameters_um is None and (sizes := one.diameters_um) is not None:
+            diameters_um = sizes["all"] if list(sizes) == ["all"] else sizes
 
     def read(file: Path, data: bytes) -> Tests:
         return _read_by_one(data, file, described) if described else _read_known(data, file)
