@@ -176,8 +176,6 @@ def law_for_each(
     strain_scaling: StrainScaling | str = StrainScaling.RAW,
 ) -> MccLaw:
     """One law per particle: its own plastic coefficients (leading axis N), a and modulus shared."""
-    if jnp.ndim(plastic.C1) != 1:
-        raise InputError("plastic has no leading axis", remedy="For one particle make a MccLaw.")
     return eqx.filter_vmap(lambda one: MccLaw(one, a, effective_modulus_MPa, unloading, strain_scaling))(plastic)
 
 

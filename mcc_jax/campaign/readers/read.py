@@ -1,25 +1,29 @@
-"""One entry for all instrument files, alone or in a folder."""
+"""One entry for all instrument files, alone or in a folder, and the diameters of their particles."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ... import arguments
 from ..._errors import InputError
-from ..._format import counted
+from ..._format import counted, first_few
+from ..csv import read_particles
 from ..findings import Finding
 from ..schema import CHANNELS, Campaign, Metadata, check_campaign
-from ..tables import binary_kind, is_workbook, read_bytes
+from ..tables import binary_kind, is_workbook, parse_number, read_bytes, same_text
 from . import fischer, hysitron, micromaterials
-from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
 from .mapped import read_mapped
 from .mapping import MappingFile, read_mapping
 from .text import Tests, decode_lines
 
+Triple = Sequence[float | int] | np.ndarray
+Diameters = Mapping[str, Triple] | Triple
 FORMATS = {
     "Fischer HM export": (fischer.matches, fischer.read),
     "Hysitron hld": (hysitron.is_hld, hysitron.read_hld),
@@ -138,3 +142,72 @@ def _content(tests: Tests) -> tuple[Any, ...]:
     readings = [(name, *(getattr(curve, c).tobytes() for c in CHANNELS)) for name, curve in tests.curves.items()]
     sizes = {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
     return readings, sizes, tests.control
+
+
+# ---- diameters, which instrument files do not hold -------------------------------------------------------------------
+
+_SIZES = (
+    "Give --diameters D1,D2,D3 in um for all, or --diameters FILE, a CSV or xlsx table with particle,D1_um,D2_um,D3_um"
+)
+
+
+def read_diameters(text: str | os.PathLike[str]) -> Diameters:
+    """Diameters from the command line: three numbers for all particles, or a mapping from names to three numbers [um].
+
+    `text` is `D1,D2,D3` in um, or the path of a table (CSV, with semicolons or tabs, or xlsx) with the columns
+    `particle` (or `file`, `test`), `D1_um`, `D2_um`, `D3_um` (or other units of length). `InputError` if it is neither,
+    or a diameter is not positive.
+    """
+    path = arguments.file_path(text, "diameters")
+    parts = str(text).split(",")
+    if len(parts) == 3 and not os.path.isfile(path):  # noqa: PTH113  # Path's raises where a name is too long
+        try:
+            values = [parse_number(part) for part in parts]
+        except ValueError as error:
+            raise InputError(f"--diameters: {error}", remedy=_SIZES) from None
+        return arguments.one_particle(values, "--diameters").tolist()
+    names, diameters, _ = read_particles(path, ("particle", "file", "test"))
+    return dict(zip(names, diameters.tolist(), strict=True))
+
+
+def diameters_for(
+    keys: Mapping[str, Sequence[str]],
+    diameters: Diameters | None,
+    in_files: Mapping[str, list[float] | InputError],
+    file: Path,
+) -> tuple[np.ndarray, int]:
+    """Diameters [um] of the tests, shape (N, 3), and how many entries of a table no test needed; an error if one lacks.
+
+    `keys` holds, by the name of each test, the names under which a table may hold its diameters, the best first; a
+    triple for all tests, or a table, counts before what the files hold.
+    """
+    if diameters is not None and not isinstance(diameters, Mapping):
+        return np.tile(arguments.one_particle(diameters), (len(keys), 1)), 0
+    table = {
+        same_text(name): arguments.one_particle(triple, f"diameters of {name!r}")
+        for name, triple in (diameters or {}).items()
+    }
+    found: list[Triple] = []
+    used: set[str] = set()
+    lacking: dict[str, InputError | None] = {}
+    for name, others in keys.items():
+        key = next((same_text(other) for other in others if same_text(other) in table), None)
+        own = in_files.get(name)
+        if key is not None:
+            used.add(key)
+            found.append(table[key])
+        elif isinstance(own, list):
+            found.append(own)
+        else:
+            lacking[name] = own
+    if not lacking:
+        return np.array(found, float), len(table) - len(used)
+    names = first_few(map(repr, lacking), 8)
+    why = next(iter(lacking.values()))
+    if why is not None:
+        raise why if len(lacking) == 1 else why.changed(problem=f"{why.problem} (tests without diameters: {names})")
+    if not table:
+        raise InputError("instrument exports do not contain particle dimensions", file=file, remedy=_SIZES)
+    problem = f"there are no diameters for {len(lacking)} of {len(keys)} tests: {names}"
+    remedy = f"Add rows named like the tests or their files; the table has rows for: {first_few(map(repr, table), 8)}"
+    raise InputError(problem, file=file, remedy=remedy)
