@@ -202,10 +202,8 @@ def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarr
 def no_curve(
     climb_um: np.ndarray, stress_max_MPa: float, threshold_MPa: float, *, least_points: int, noise_um: float = 0.0
 ) -> Finding | None:
-    """Why a test that loads has no curve that a law could be compared with; None if it has one.
-
-    `climb_um` is its displacement along the loading that counts, shape (n,), and must grow beyond its noise.
-    """
+    """Why a test that loads has no curve that a law could be compared with; None if it has one. `climb_um`, its
+    displacement along the loading that counts, must grow beyond its noise."""
     if stress_max_MPa <= threshold_MPa:
         return below_threshold(stress_max_MPa, threshold_MPa)
     if len(climb_um) < least_points:

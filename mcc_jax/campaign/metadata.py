@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import json
 import math
@@ -28,7 +27,6 @@ _WRITE = {
     "provenance": 'it in quotes, provenance = "..."',
     "corrections": 'a list of names, corrections = ["frame_compliance"]',
 }
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def load_toml(text: str, file: Path) -> dict[str, Any]:
@@ -133,7 +131,7 @@ def _positive(entries: dict[str, Any], quantity: str, dimension: str, file: Path
 
 def format_metadata(metadata: Metadata, file: Path) -> str:
     """The text of a `campaign.toml`; `InputError` if it would not read back as the same metadata."""
-    known = {field.name: getattr(metadata, field.name) for field in dataclasses.fields(metadata)}
+    known = dict(vars(metadata))
     other = known.pop("other")
     for key in other:
         if not isinstance(key, str) or key in known:
@@ -162,7 +160,7 @@ def _table(entries: Mapping[str, Any]) -> str:
 def _key(key: Any) -> str:
     if not isinstance(key, str):
         raise TypeError(f"the key {key!r} is not text")
-    return key if _BARE.fullmatch(key) else _string(key)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _string(key)
 
 
 def _string(text: str) -> str:

@@ -222,11 +222,8 @@ def filled(cells: Sequence[str]) -> int:
 
 
 def make_table(records: Sequence[list[str]], rows: Sequence[int], file: Path, delimiter: str = ",") -> Table:
-    """A table from the cells of its records, the header first, and the row in which each begins.
-
-    Empty records are skipped, and empty cells behind the last column that has a name dropped. Raises `InputError` if a
-    record has another number of cells than the header, or there is none below it.
-    """
+    """A table from the cells of its records, the header first, and the row in which each begins; empty records, and
+    empty cells behind the last column that has a name, are dropped."""
     full = [i for i, cells in enumerate(records) if (cells and cells[0].strip()) or filled(cells)]
     if not full:
         raise InputError("the file is empty", file=file, remedy="Export it again")
@@ -285,9 +282,6 @@ def split(text: str, file: Path, delimiter: str) -> tuple[list[list[str]], Seque
     return records, lines[:-1]
 
 
-_FIRST_LINE = re.compile(r"\s*[^\r\n]*")
-
-
 def read_table(file: Path, names: str = "") -> Table:
     """A table of a file; if a column of `names` is given, the others are numbers, parsed at once if all are plain."""
     text = decode(read_bytes(file), file)
@@ -319,7 +313,7 @@ def plain_table(text: str, file: Path, names: str) -> Table | None:
 
 def parse_table(text: str, file: Path) -> Table:
     """A whole table of text; its delimiter is the commonest, outside of quotes, in the first line that is not blank."""
-    header = re.sub('"[^"]*"', "", _FIRST_LINE.match(text)[0])  # type: ignore[index]  # it matches every text
+    header = re.sub('"[^"]*"', "", re.match(r"\s*[^\r\n]*", text)[0])  # type: ignore[index]  # it matches every text
     delimiter = max(",;\t", key=header.count)
     return make_table(*split(text, file, delimiter), file, delimiter)
 
@@ -347,12 +341,9 @@ def read_sheet(
     decimal_mark: str = ".",
     how: str = "",
 ) -> list[list[str]]:
-    """The cells of all rows of a sheet as text, numbers with all their digits and this decimal mark.
-
-    The sheet has this name or number, 1 for the first; without one it is the `preferred` one, or the only one that
-    holds anything. Raises `InputError` if the workbook is damaged or too large, or the sheet is not clear; `how` is how
-    to choose one.
-    """
+    """The cells of all rows of a sheet as text, numbers with all their digits and this decimal mark. It is the sheet of
+    this name or number, 1 for the first, else the `preferred` one, or the only one that holds anything; `how` is how to
+    choose one."""
     import pandas as pd
 
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -398,7 +389,6 @@ def read_sheet(
 DIMENSIONS = {"time": "time", "force": "force", "displacement": "length"}
 CANONICAL = {"force": "mN", "length": "um", "time": "s"}
 EXAMPLES = {"force": "mN, N, uN, kN, gf", "length": "um, nm, mm, m", "time": "s, ms, min"}
-_UNIT = re.compile(r"[A-Za-zµμ]{1,24}")
 
 
 @cache
@@ -418,7 +408,7 @@ def unit_factor(unit: str, dimension: str) -> Fraction:
         return Fraction(1)
     if not unit:
         raise ValueError("the unit is missing")
-    if _UNIT.fullmatch(unit) is None:
+    if re.fullmatch(r"[A-Za-zµμ]{1,24}", unit) is None:
         raise ValueError(f"{unit!r} is not a unit")
     try:
         quantity = _registry().Quantity(Fraction(1), unit)
@@ -442,9 +432,7 @@ def find_column(
     header: Sequence[str], quantity: str, dimension: str, file: str | Path, *, what: str = "column"
 ) -> tuple[int, Fraction]:
     """Where a name such as "force", without its unit, is in a header, and what turns the unit into the canonical one.
-
-    Raises `InputError`, in which the names are called `what`, if there is none, or two, or no unit or a wrong one.
-    """
+    The error calls the names `what`."""
     expected = f"{quantity}_{CANONICAL[dimension]}"
     units = f"units, as a suffix: {EXAMPLES[dimension]} (for example {expected})"
     found = [i for i, name in enumerate(header) if name.rpartition("_")[0] == quantity]

@@ -6,14 +6,13 @@ import shlex
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from typing import get_args
 
 import click
 
 from . import options as common
 from .printing import say, say_next
 from .session import session
-
-KINDS = ("approach", "load", "hold", "unload", "reload")
 
 
 @click.command(short_help="Turn an instrument's file, or a folder of them, into a campaign.")
@@ -83,7 +82,7 @@ def convert(
     force = [float(curve.force_mN.max()) for curve in tests]
     displacement = [float(curve.displacement_um.max()) for curve in tests]
     say(f"Max force {span(force, 'mN')}, max displacement {span(displacement, 'um')}.")
-    say("Segments: " + ", ".join(f"{segments[kind]} {kind}" for kind in KINDS) + ".")
+    say("Segments: " + ", ".join(f"{segments[kind]} {kind}" for kind in get_args(campaign.SegmentKind)) + ".")
     noted = map(campaign.Finding.from_json, tests.metadata.other.get("conversion", {}).get("findings", ()))
     found = campaign.campaign_findings(campaign.check_tests(tests))
     for one in (*noted, *campaign.check_plausibility(tests), *found):

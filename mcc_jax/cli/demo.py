@@ -171,13 +171,9 @@ def sealed_answer(seed: int) -> tuple[HiddenEffect, str]:
     low, high = STRENGTHS[name]
     amplitude = float(f"{low * (high / low) ** rng.random():.3g}")
     variant = find_variant(name)
-    answer = {
-        "mechanism": name,
-        "variant": variant.name,
-        "parameters": {variant.parameter: amplitude} | {n.name: n.middle for n in variant.nuisances},
-        "nonce": rng.bytes(16).hex(),
-    }
-    return HiddenEffect(variant, amplitude), json.dumps(answer) + "\n"
+    effect = HiddenEffect(variant, amplitude)
+    answer = {"mechanism": name, "variant": variant.name, "parameters": effect.numbers, "nonce": rng.bytes(16).hex()}
+    return effect, json.dumps(answer) + "\n"
 
 
 def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:

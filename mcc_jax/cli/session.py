@@ -37,10 +37,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy
 
 @contextlib.contextmanager
 def session() -> Iterator[Progress]:
-    """Double precision, and progress on standard error: the present step on a terminal, a line for each elsewhere.
-
-    Yields a function to be called with the name of each step as it begins.
-    """
+    """Double precision, and progress on standard error: a function to be called with each step as it begins."""
     with _progress() as progress:
         progress("loading the library")
         for noisy in ("jax", "matplotlib"):  # hints about accelerators and caches are not for a pipe
@@ -64,11 +61,8 @@ CACHE_BYTES = 300 * 2**20  # most disk used for compiled functions; the oldest a
 
 
 def _keep_compiled(config: Any) -> None:
-    """Let the next process find what this one compiles, in the user's folder for caches, one for each machine.
-
-    JAX_COMPILATION_CACHE_DIR and JAX_ENABLE_COMPILATION_CACHE=0 have precedence. What is there will be run, so a folder
-    that others could write to is not used.
-    """
+    """Let the next process find what this one compiles, in the user's folder for caches, one for each machine, but if
+    others could write to it, since what is there will be run. JAX's own settings have precedence."""
     if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
         return
     import platform
@@ -117,10 +111,8 @@ QUIET_S = 2.0
 
 @contextlib.contextmanager
 def _logged(stream: Any) -> Iterator[Progress]:
-    """Write a line for each step as it begins, with the seconds since the command began.
-
-    Lines are held back for `QUIET_S`, counted from the second step, so that bad input is answered by its error alone.
-    """
+    """Write a line for each step as it begins, with the seconds since the command began; held back for `QUIET_S`,
+    counted from the second step, so that bad input is answered by its error alone."""
     began, lines, lock = time.monotonic(), list[str](), threading.Lock()
 
     def write() -> None:
@@ -200,10 +192,7 @@ def drop_earlier(stage: Stage, result: str, names: Sequence[str]) -> None:
 def write_result(
     result: Calibration | Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
 ) -> dict[str, Any]:
-    """Write a calibration or a discovery, its figures and, if it is one, the posterior into the stage.
-
-    `origin` is what `provenance` gives. Returns the contents of the JSON.
-    """
+    """Write a calibration or a discovery, its figures and its posterior, if it is one; the contents of the JSON."""
     from ..calibrate import Posterior
 
     progress("drawing the figures" if figures else "writing")

@@ -80,10 +80,8 @@ class HiddenEffect:
         return {self.variant.parameter: self.strength, **middle, **self.nuisance}
 
     def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
-        """The effect with a leading axis N in every field, and its parameters by name, shape (N,), of N tests.
-
-        `place` is that among the effects of a campaign, each of which has its own random numbers.
-        """
+        """The effect with a leading axis N in every field, and its parameters by name, shape (N,), of N tests; at
+        each place among the effects of a campaign with its own random numbers."""
         values = {name: np.full(count, value) for name, value in self.numbers.items()}
         nuisances = {one.name: one for one in self.variant.nuisances}
         for i, name in enumerate(self.random):

@@ -130,7 +130,8 @@ def simulate_batch(
     relative_humidity: Any = None,
     control: Control = "displacement",
 ) -> Response:
-    """`drive` for N particles at once, each with its own law; what it cannot drive it marks in `result`.
+    """`drive` for N particles at once, each with its own law: a response with a leading axis N in every field; what it
+    cannot drive it marks in `result`.
 
     Args:
         laws: a law whose every array field has a leading axis N.
@@ -139,9 +140,6 @@ def simulate_batch(
         times: times [s], likewise, for laws with effects.
         relative_humidity: of every test [%], shape (N,), for laws with effects; the reference if None.
         control: what `paths` are, "displacement" or "load".
-
-    Returns:
-        A response with a leading axis N in every field.
     """
     arguments.choice(control, get_args(Control), "control")
     _check_times(laws, times is not None, "times")

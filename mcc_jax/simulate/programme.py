@@ -118,10 +118,7 @@ class Programme:
         return cls(control, steps, interval_s, points)
 
     def sample(self, peak: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s], strictly increasing, and target values (mN or um) for a particle whose peak is `peak`.
-
-        A programme that never leaves zero raises `InputError`.
-        """
+        """Times [s], strictly increasing, and target values (mN or um) for a particle whose peak is `peak`."""
         peak = arguments.number(peak, "the peak of a particle [mN or um]", above=0)
         times, values = [0.0], [0.0]
         for step in self.steps:
@@ -181,11 +178,7 @@ def _rounded(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def read_programme(file: str | Path) -> Programme:
-    """Read a programme from a TOML file, as in the example of `mcc-jax simulate --help`.
-
-    Raises:
-        InputError: naming the file and the entry.
-    """
+    """Read a programme from a TOML file, as in the example of `mcc-jax simulate --help`."""
     file = arguments.file_path(file, "file")
     entries = load_toml_file(file)
     known = ("control", "rate", "points", "interval_s", "step")

@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from ..schema import Control
-from .text import Tests, checked_curve, cut_off, leading_number, number_block
+from .text import Tests, checked_curve, cut_off, number_block
 
 _BLOCK = re.compile(r"(Sample Approach|Drift Measurement|Test) Data Points: *(\d{1,9})\s*")
 _FORCES = ("Force_µN", "Force_uN", "Force_μN")
 _COUNT = re.compile(r"Number of Points *= *(\d{1,9})\s*")
+_NUMBER = r"([-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?)"
+_COMPLIANCE, _DRIFT = re.compile(f"{_NUMBER}.*nm/[µuμ]N"), re.compile(f"{_NUMBER}.*nm/s")
 _TIME, _DEPTH, _LOAD = "Time (s)", "Depth (nm)", "Load (µN)"
 
 
@@ -89,13 +91,10 @@ def _facts(header: list[tuple[str, str]]) -> dict[str, Any]:
             segments.append({})
         segments[-1][key.removeprefix("Segment ")] = value
     other: dict[str, Any] = {}
-    for key, units, name, divisor in (
-        ("Machine Comp", ("nm/µN", "nm/uN", "nm/μN"), "machine_compliance_um_per_mN", 1.0),  # nm/uN is um/mN
-        ("Drift Rate", ("nm/s",), "drift_rate_um_per_s", 1e3),
-    ):
-        value = leading_number(plain.get(key, ""))
-        if value is not None and plain[key].endswith(units):
-            other[name] = value / divisor
+    if compliance := _COMPLIANCE.fullmatch(plain.get("Machine Comp", "")):
+        other["machine_compliance_um_per_mN"] = float(compliance[1])  # nm/uN is um/mN
+    if drift := _DRIFT.fullmatch(plain.get("Drift Rate", "")):
+        other["drift_rate_um_per_s"] = float(drift[1]) / 1e3
     return other | {"programmed_segments": segments, "instrument_header": plain}
 
 

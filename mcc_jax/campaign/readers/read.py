@@ -177,10 +177,7 @@ def diameters_for(
     file: Path,
 ) -> tuple[np.ndarray, int]:
     """Diameters [um] of the tests, shape (N, 3), and how many entries of a table no test needed; an error if one lacks.
-
-    `keys` holds, by the name of each test, the names under which a table may hold its diameters, the best first; a
-    triple for all tests, or a table, counts before what the files hold.
-    """
+    `keys` holds, by the name of each test, the names under which a table may hold its diameters, the best first."""
     if diameters is not None and not isinstance(diameters, Mapping):
         return np.tile(arguments.one_particle(diameters), (len(keys), 1)), 0
     table = {

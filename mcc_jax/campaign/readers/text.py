@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +13,6 @@ from ..._errors import InputError
 from ..._format import counted
 from ..schema import Control, Curve, fault_of
 from ..tables import Table, check_header
-
-_NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 
 
 @dataclass(frozen=True)
@@ -74,9 +71,3 @@ def checked_curve(
 def cut_off(problem: str, file: Path, row: int | None = None) -> InputError:
     """The error for a file that ends too early or lacks a part."""
     return InputError(problem, file=file, row=row, remedy="The file is cut off or damaged; export it again")
-
-
-def leading_number(text: str) -> float | None:
-    """The number a text such as `0.0066 nm/uN` begins with."""
-    match = _NUMBER.match(text.strip())
-    return float(match[0]) if match else None
