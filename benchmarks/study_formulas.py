@@ -84,11 +84,11 @@ def in_span(
     products = gram(base, columns[..., [k, s]])
     unit = min(LAMBDA / np.sqrt(products[0, 0]), truth.plausible[1] / truth.plausible[0])
     amplitude = unit * products[0, 1] / products[1, 1]
-    siblings = {name: columns[..., j] for name, j in best.items()}
+    siblings = [columns[..., j] for name, j in best.items() if name != sibling.name]
     here = design_of(base, base.state)
     seen = visible(base.hyperparameters, here, columns[..., s : s + 1])[0]
     smooth = functions(LIBRARY[sibling.mechanism].coordinates, at)
-    span = seen * misfit_columns(sibling, amplitude * columns[..., s], smooth, siblings)
+    span = seen * misfit_columns(amplitude * columns[..., s], smooth, siblings)
     count = span.shape[-1]
     products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))
     alone = remaining(products[:2, :2], np.zeros(1))

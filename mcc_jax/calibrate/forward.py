@@ -38,7 +38,7 @@ Latent = Float[Array, " 4"]
 
 @functools.cache
 def _formula(variant: Variant) -> Formula:
-    return Formula(variant.build(1.0), ("amplitude", *(n.name for n in variant.nuisances)))
+    return Formula(replace(variant.build(1.0), label=""), ("amplitude", *(n.name for n in variant.nuisances)))
 
 
 class Forms(eqx.Module):

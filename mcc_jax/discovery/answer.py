@@ -24,11 +24,12 @@ from .base import Base
 from .design import Design, further_priors
 from .evidence import LinearModel, Solution, residual_of, whitened
 from .fit import Fitted, moved
-from .hypothesis import UNLISTED, Names, RandomEffects
+from .hypothesis import Names, RandomEffects
 from .result import Effect, Likeness, Place, Residuals
 from .search import Search
-from .settings import AT_PEAKS, DECISIONS, DETECTABLE, POPULATION
+from .settings import AT_PEAKS, DECISIONS, DETECTABLE, POPULATION, UNLISTED
 
+Estimates = tuple[np.ndarray, np.ndarray, np.ndarray]  # means, errors, spreads between particles
 KINDS = {LOAD: "loading", HOLD: "hold", UNLOAD: "unloading", RELOAD: "reloading"}
 BINS = 5  # of load in which disagreement is looked for
 REPORTED = 0.85  # places are reported until they hold this share of the disagreement
@@ -46,11 +47,9 @@ def parameters_with(search: Search) -> dict[str, Any]:
     return averaged(each, np.array(weights) / sum(weights), len(search.base.tests))
 
 
-def averaged(
-    each: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], weights: np.ndarray, particles: int
-) -> dict[str, Any]:
-    """Parameters by name from means, errors and spreads, which are weighted: log C as Student's t with one degree of
-    freedom less than there are particles, a and the modulus, which no spread of particles limits, as normal."""
+def averaged(each: Sequence[Estimates], weights: np.ndarray, particles: int) -> dict[str, Any]:
+    """Parameters by name from weighted estimates: log C as Student's t with one degree of freedom less than there are
+    particles, a and the modulus, which no spread of particles limits, as normal."""
     from scipy.optimize import root_scalar
     from scipy.stats import t as student
 
@@ -82,9 +81,7 @@ def averaged(
     return found | {f"log_{name}": {"mean": estimate(*log), "sd": sd} for name, log, sd in coefficients}
 
 
-def population_under(
-    base: Base, formulas: Fitted | None, hyper: np.ndarray, design: Design
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def population_under(base: Base, formulas: Fitted | None, hyper: np.ndarray, design: Design) -> Estimates:
     """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, which a
     misfit widens (Brynjarsdottir and O'Hagan 2014), and the spreads of the coefficients."""
     model = LinearModel(hyper, design)
@@ -188,11 +185,8 @@ def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
     return tuple(n for n in pairs if len(leader) == 1 and leader[0] not in n)
 
 
-def sets_of(
-    search: Search, leader: Names, effects: Sequence[Effect], pairs: Sequence[Names]
-) -> tuple[tuple[str, ...], ...]:
-    """For each effect that was added, itself and what may be in its place, most probable first; those of `pairs`
-    last."""
+def sets_of(search: Search, leader: Names, effects: Sequence[Effect], pairs: Sequence[Names]) -> tuple[Names, ...]:
+    """For each effect that was added, itself and what may be in its place, most probable first, `pairs` last."""
     alike = {names: one for names, one in search.found.items() if len(names) == len(leader) and names != UNLISTED}
     found = []
     for effect in effects:

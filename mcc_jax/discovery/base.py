@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -22,8 +22,10 @@ from ..calibrate.particle_fit import snaps
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..calibrate.running import Blocks
 from ..campaign import Campaign, find_segments
+from ..effects import Mechanism
 from .settings import DECISIONS
 
+Library = Mapping[str, Mechanism]
 BLOCK = 8  # particles that are linearised at once: one program for any number of them
 
 

@@ -10,15 +10,14 @@ import numpy as np
 
 from .._format import described
 from .evidence import LinearModel
-from .hypothesis import UNLISTED
 from .search import Search
-from .settings import HYPERPARAMETERS, WAVES
+from .settings import HYPERPARAMETERS, UNLISTED, WAVES
 
 POINTS = 60  # of the curve
 SHORTLIST = 24  # terms that are tried in pairs
 ONE_TERM = 0.9  # share of what two terms of a formula explain from which on one term will do
 
-LETTERS = {
+LETTERS = {  # coordinates of a formula: letter and meaning
     "strain": ("e", "reduced peak strain (1 + a H) epsilon_P"),
     "peak": ("s", "square root of the peak stress [MPa]"),
     "travel": ("g", "displacement / D_e"),
@@ -26,7 +25,6 @@ LETTERS = {
     "clock": ("t", "time [s]"),
     "force": ("F", "force [mN]"),
 }
-"""Coordinates of a formula: letter and meaning."""
 
 
 @dataclass(frozen=True)
@@ -132,9 +130,7 @@ def closure(search: Search, seed: int) -> Closure:
     )
 
 
-def _best_terms(
-    model: LinearModel, count: int, rows: np.ndarray, *, one: bool = False
-) -> tuple[tuple[int, ...], np.ndarray]:
+def _best_terms(model: LinearModel, count: int, rows: Any, *, one: bool = False) -> tuple[tuple[int, ...], np.ndarray]:
     """The term, or the two, that explain most in some particles, and their weights."""
     shared = model.shared(rows)
     G, s = shared.information[:count, :count], shared.score[:count]

@@ -25,6 +25,7 @@ from ..calibrate.running import compiled
 from ..effects import Variant
 from .base import Base, State
 
+Variants = tuple[Variant, ...]  # the formulas of a hypothesis
 LOG_2PI = float(np.log(2 * np.pi))
 
 AT_ONCE = 6, 18  # columns that are whitened in one call, at least and at most
@@ -45,14 +46,9 @@ class White(NamedTuple):
 
 @compiled
 def white_of(
-    logs: Float[Array, " 4"],
-    scale: Array,
-    tests: Tests,
-    linear: Linear,
-    columns: Float[Array, "particles points few"],
-    correlation: Correlation,
+    logs: Array, scale: Array, tests: Tests, linear: Linear, columns: Array, correlation: Correlation
 ) -> White:
-    """Whiten columns of all tests, at the logarithms of the noise's four numbers."""
+    """Whiten columns of all tests, shape (N, points, few), at the logarithms of the noise's four numbers."""
     noise = Noise.from_logs(logs, scale)
 
     def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> White:
@@ -92,8 +88,8 @@ class Columns:
     def _given(self, hyper: np.ndarray, piece: Array) -> tuple[Any, ...]:
         return jnp.asarray(hyper[:4]), *self.arrays, piece, self.correlation
 
-    def _whitened(self, hyper: np.ndarray) -> White:
-        """The columns that are not zero, padded; those of the last call are kept."""
+    def white(self, hyper: np.ndarray) -> White:
+        """The columns that are not zero, whitened and padded; those of the last call are kept."""
         noise = np.asarray(hyper[:4], float).tobytes()
         last = self._white  # another thread may put its own in place meanwhile
         if last is not None and last[0] == noise:
@@ -103,15 +99,9 @@ class Columns:
         self._white = noise, white
         return white
 
-    def white(self, hyper: np.ndarray) -> White:
-        """Whitened at the hyperparameters."""
-        white, columns = self._whitened(hyper), np.zeros(self.shape)
-        columns[..., self.some] = white.columns[..., : len(self.some)]
-        return white._replace(columns=columns)
-
     def gram(self, hyper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gram matrix of every particle's whitened columns, and log density of the noise at 0."""
-        white, last = self._whitened(hyper), self._gram
+        white, last = self.white(hyper), self._gram
         if last is not None and last[0] is white:
             return last[1], white.log_density
         k, gram = len(self.some), np.zeros((self.shape[0], self.shape[2], self.shape[2]))
@@ -121,9 +111,8 @@ class Columns:
         return gram, white.log_density
 
     def slope(self, hyper: np.ndarray, of_gram: np.ndarray) -> np.ndarray:
-        """Derivatives of something plus the noise's log density by the noise's numbers, from those by the Gram
-        matrices."""
-        white, k = self._whitened(hyper).columns, len(self.some)
+        """Derivatives by the noise's numbers of its log density plus something, from those of that by the `gram`."""
+        white, k = self.white(hyper).columns, len(self.some)
         padded = np.zeros((self.shape[0], white.shape[-1], white.shape[-1]))
         padded[:, :k, :k] = 2 * of_gram[:, self.some[:, None], self.some]
         weights, ones, total = np.split(white @ padded, len(self.pieces), -1), np.ones(self.shape[0]), np.zeros(4)
@@ -189,11 +178,7 @@ NO_EXTRA = ExtraColumns()
 
 
 def design_of(
-    base: Base,
-    state: State,
-    variants: tuple[Variant, ...] = (),
-    more: ExtraColumns = NO_EXTRA,
-    linear: Linear | None = None,
+    base: Base, state: State, variants: Variants = (), more: ExtraColumns = NO_EXTRA, linear: Linear | None = None
 ) -> Design:
     """The design of a hypothesis around a state, from the tests linearised there if they are already."""
     tests, point, (middle, factor) = base.tests, state.point, base.population_prior
@@ -211,8 +196,7 @@ def design_of(
     mean, sd, positive = further_priors(variants)
     now = theta[0, names:]
     further = further * np.where(positive, now, 1.0)
-    for k, far in enumerate(mean - np.where(positive, np.log(np.where(positive, now, 1.0)), now)):
-        data = data - further[..., k] * far
+    data = data - further @ (mean - np.where(positive, np.log(np.where(positive, now, 1.0)), now))
     common = np.concatenate([of_law @ (slope @ factor), sd * further, *more.misfits], -1)
     fixed = common.shape[-1] - sum(columns.shape[-1] for columns in more.misfits)
     group = [0] * fixed + [k for k, columns in enumerate(more.misfits, 1) for _ in range(columns.shape[-1])]
@@ -236,7 +220,7 @@ def design_of(
     )
 
 
-def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
+def linear_at(base: Base, state: State, variants: Variants) -> Linear:
     """The tests linearised at a state."""
     return base.each(linearise, state.point, Forms(base.model.unloading, variants))
 
@@ -253,17 +237,13 @@ def _prior_of_noise(model: Model) -> np.ndarray:
     return np.stack([np.log(np.asarray(prior.median)), np.asarray(prior.log_sd)])
 
 
-@compiled
-def _means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> tuple[Array, Array]:
-    def means(beta: Array) -> Array:
-        log_eta = jnp.log1p(jnp.maximum(beta[0] * flatness, -0.99))
-        b = beta[2:5][None] + (log_eta - jnp.mean(log_eta))[:, None]
-        return jnp.concatenate([b, (beta[1] + power * log_eta)[:, None]], 1)
-
-    return means(beta), jax.jacfwd(means)(beta)
-
-
-def particle_means(population: Any, flatness: Any, power: float) -> tuple[np.ndarray, np.ndarray]:
+def particle_means(population: Any, flatness: np.ndarray, power: float) -> tuple[np.ndarray, np.ndarray]:
     """Means of the particles' b1, b3, b5, e under a population at the average shape, and their derivatives by it."""
-    means, slope = _means_and_slope(jnp.asarray(population), jnp.asarray(flatness), power)
-    return np.asarray(means), np.asarray(slope)
+    a, log_modulus, *b = np.asarray(population)
+    log_eta = np.log1p(np.maximum(a * flatness, -0.99))
+    by_a = np.where(a * flatness > -0.99, flatness / np.exp(log_eta), 0.0)
+    means = np.column_stack([*(one + log_eta - log_eta.mean() for one in b), log_modulus + power * log_eta])
+    slope = np.zeros((*means.shape, 5))
+    slope[..., 0] = np.column_stack([*3 * [by_a - by_a.mean()], power * by_a])
+    slope[:, range(4), [2, 3, 4, 1]] = 1.0
+    return means, slope

@@ -23,17 +23,19 @@ from ..campaign.findings import named
 from ..campaign.force_zero import open_zero
 from ..effects import LIBRARY, Mechanism
 from . import answer
-from .base import Base, base_fit
+from .base import Base, Library, base_fit
 from .closure import closure
 from .design import design_of
-from .hypothesis import UNLISTED, Names
+from .hypothesis import Names
 from .plan import next_experiments, without_effects
 from .result import Discovery
 from .screen import located, untestable, without_punch
 from .search import Search
 from .sentences import summary_of, taken_back
-from .settings import AT_PEAKS
+from .settings import AT_PEAKS, UNLISTED
 from .verify import held_out, p_anything
+
+Fit = Callable[[Campaign], Base]  # of the base law
 
 LEAST = 3  # particles of which one can be held out
 LINEAR = "amplitudes and parameters are those of the linear model at its optimum"
@@ -145,14 +147,7 @@ def discover(
     return _finished(found, findings, started)
 
 
-def _begun(
-    campaign: Campaign,
-    findings: Sequence[Finding],
-    *,
-    fitted: Callable[[Campaign], Base],
-    known: Mapping[str, Mechanism],
-    progress: Progress,
-) -> Search:
+def _begun(campaign: Campaign, findings: Sequence[Finding], fitted: Fit, known: Library, progress: Progress) -> Search:
     """The search with the law alone in it."""
     base, left_out = _settled_fit(campaign, findings, fitted)
     known = without_punch(known, base)
@@ -161,16 +156,13 @@ def _begun(
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     progress("signatures of all effects")
     with numbers_in_reach(base.campaign):
-        search = Search(base, testable, progress, whole=known)
+        search = Search(base, testable, known, progress)
     search.untestable, search.left_out = missing, left_out
     return search
 
 
-def _settled_fit(
-    campaign: Campaign, findings: Sequence[Finding], fitted: Callable[[Campaign], Base]
-) -> tuple[Base, list[Finding]]:
-    """The base fit without what would be taken for physics: tests that cannot be relied on or whose residual is unlike
-    all others'; and what is said of these."""
+def _settled_fit(campaign: Campaign, findings: Sequence[Finding], fitted: Fit) -> tuple[Base, list[Finding]]:
+    """The base fit without tests that cannot be relied on or are unlike all others, and what is said of these."""
     unsafe = tuple(dict.fromkeys(name for one in findings if one.level == "error" for name in one.particles))
     left_out = []
     if unsafe and len(unsafe) < len(campaign):
@@ -202,8 +194,7 @@ def _run(search: Search, seed: int) -> None:
 
 
 def _not_tared(campaign: Campaign, search: Search, begun: Callable[..., Search], seed: int) -> Search | None:
-    """The search with what the tests begin at taken off their force, if then nothing is missing and the evidence is
-    larger than that of anything named with the zero of the file; else None."""
+    """The search with another zero of force, if with it nothing is missing and the evidence is larger; else None."""
     zero = open_zero(campaign)
     if zero is None:
         return None
@@ -234,7 +225,7 @@ def _of_law_alone(found: Discovery, search: Search) -> Discovery:
     return replace(found, residuals=left, places=answer.places(search.base, left.before))
 
 
-def _named(found: Discovery, search: Search, winner: Names, known: Mapping[str, Mechanism]) -> Discovery:
+def _named(found: Discovery, search: Search, winner: Names, known: Library) -> Discovery:
     """The answer with the leading hypothesis: effects or a formula, where, and what it did to the parameters."""
     fitted = search.found[winner].at
     assert fitted is not None

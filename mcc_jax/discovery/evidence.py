@@ -331,14 +331,6 @@ class _Surface:
         found = self._minimise(self.of_misfits(x), x[self.first :], bounds=bounds)
         return float(found.fun), np.append(x[: self.first], found.x)
 
-    def likely(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The mode, or that of another setting of correlated noise, which may have swallowed what misfits explain."""
-        shorter = LENGTH_FACTORS[-1]
-        factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NOISE_FACTORS[1:])])
-        some = [self.followed(np.concatenate([x[:2], x[2:4] + by / self.scale[2:4], x[4:]])) for by in factors]
-        best = min(some, key=lambda one: one[0])
-        return best if best[0] < some[0][0] - STRONG else some[0]
-
     def mode(self, start: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """The lowest point met by L-BFGS: value, coordinates and slope."""
         x = start.copy()
@@ -382,9 +374,14 @@ class _Surface:
 
 
 def likely_start(design: Design, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where to look for the mode of a hypothesis with misfits, see `_Surface.likely`, and the log posterior there."""
+    """Where to look for the mode of a hypothesis with misfits, and the log posterior there: at the start, or at another
+    setting of correlated noise, which may have swallowed what misfits explain."""
     surface = _Surface(design)
-    value, x = surface.likely(np.minimum(start / surface.scale, surface.most))
+    x, unit = np.minimum(start / surface.scale, surface.most), surface.scale[2:4]
+    factors = np.log([(1.0, 1.0), *((factor, LENGTH_FACTORS[-1]) for factor in NOISE_FACTORS[1:])])
+    some = [surface.followed(np.concatenate([x[:2], x[2:4] + by / unit, x[4:]])) for by in factors]
+    best = min(some, key=lambda one: one[0])
+    value, x = best if best[0] < some[0][0] - STRONG else some[0]
     return x * surface.scale, -value
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,8 @@ from ..calibrate.judgement import LARGE_MISFIT
 from ..calibrate.noise import Along, Correlation, Noise, particle_scales
 from ..calibrate.numpyro_model import Model
 from ..calibrate.population import Population
-from ..effects import Variant
 from .base import Base, State
-from .design import NO_EXTRA, Design, ExtraColumns, design_of, further_priors, particle_means
+from .design import NO_EXTRA, Design, ExtraColumns, Variants, design_of, further_priors, particle_means
 from .evidence import LinearModel, Optimum, Solution, optimise, residual_of, spreads_of, whitened
 from .settings import EARLY, POPULATION, STRONG
 
@@ -33,7 +32,7 @@ WORSE = 5.0  # nats by which each of the `EARLY` first steps may make it worse b
 class Fitted:
     """A hypothesis at its optimum: evidence and numbers come from the same accepted step."""
 
-    variants: tuple[Variant, ...]
+    variants: Variants
     state: State  # where it is linear, which is where its numbers are
     design: Design
     optimum: Optimum
@@ -69,12 +68,7 @@ class Fitted:
 
 
 def fit_hypothesis(
-    base: Base,
-    state: State,
-    variants: tuple[Variant, ...],
-    numbers: Sequence[float] | np.ndarray,
-    hyper: np.ndarray,
-    more: ExtraColumns = NO_EXTRA,
+    base: Base, state: State, variants: Variants, numbers: Any, hyper: np.ndarray, more: ExtraColumns = NO_EXTRA
 ) -> Fitted:
     """The optimum of a hypothesis by Gauss-Newton, from a state of the base law and `numbers` of the effects."""
     state, value = state.with_numbers(np.asarray(numbers)), -np.inf
@@ -103,7 +97,7 @@ def fit_hypothesis(
     return Fitted(variants, state, design, optimise(design, hyper))
 
 
-def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
+def moved(base: Base, state: State, variants: Variants, solution: Solution) -> State:
     """The state at a solution, or on the way there: no positive number moves by more than a factor of e.
 
     All numbers go the same share of the way: an amplitude that is right at the solution is wrong with further numbers
@@ -170,10 +164,8 @@ def _with_own_scales(design: Design, hyper: np.ndarray, model: Model) -> tuple[O
 
 
 def with_other_noise(design: Design, hyper: np.ndarray, model: Model) -> Optimum:
-    """The mode of the hyperparameters under the noise of a model, from the mode under another.
-
-    Its log density is -inf where the correlated noise is more than a misfit may be: it would describe any test.
-    """
+    """The mode of the hyperparameters under the noise of a model, from the mode under another; -inf where correlated
+    noise is more than a misfit may be: it would describe any test."""
     other, start = design.with_noise(model), hyper.copy()
     start[3] = other.noise[0, 3]  # the length's unit may be another
     found = optimise(other, start, curvature=False)

@@ -3,9 +3,9 @@ discrepancy that no mechanism explains."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import betaln, expit, logsumexp
@@ -14,14 +14,13 @@ from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..effects import Variant
 from .base import Base, State
-from .design import NO_EXTRA, Design, ExtraColumns, design_of, linear_at
+from .design import NO_EXTRA, Design, ExtraColumns, Variants, design_of, linear_at
 from .evidence import LinearModel, likely_start, log_joint, optimise, visible, with_little_noise
 from .fit import Fitted, fit_hypothesis, moved
 from .screen import Candidates, single_integrals
-from .settings import DECISIONS, EARLY, HYPERPARAMETERS, VERY_STRONG
+from .settings import DECISIONS, EARLY, HYPERPARAMETERS, UNLISTED, VERY_STRONG
 
 Names = tuple[str, ...]
-UNLISTED: Names = ("UNLISTED",)
 
 # Priors of the spread of an amplitude over the particles, as a share of it; and of a random effect over the tests, in
 # units of the largest plausible one, open in its order of magnitude.
@@ -139,8 +138,7 @@ class Discrepancy:
     log_white: float  # logarithm of the standard deviation of white noise, by which they are measured
 
     def added_to(self, base: Base, r: Fitted, at_least: float = -np.inf) -> Fitted | None:
-        """The law, or what is named, with the discrepancy, at its optimum; None where it begins far below
-        `at_least`."""
+        """The law, or what is named, with the discrepancy at its optimum; None where it begins far below `at_least`."""
         unit, count = float(np.log(DECISIONS.general)) + self.log_white, len(self.parts)
         more = ExtraColumns(misfits=self.parts, sizes=[(unit, DECISIONS.general_log_sd, np.inf)] * count)
         design = design_of(base, r.state, r.variants, more)
@@ -197,9 +195,7 @@ class RandomEffects:
         own = np.einsum("npo,no->np", self.at.design.own[..., 5:], solution.own[:, 5:])
         return own + self.at.design.amplitude[..., K:] @ solution.amplitude[K:]
 
-    def next_to(
-        self, base: Base, state: State, variants: tuple[Variant, ...], numbers: Sequence[float], hyper: np.ndarray
-    ) -> RandomEffects:
+    def next_to(self, base: Base, state: State, variants: Variants, numbers: Any, hyper: np.ndarray) -> RandomEffects:
         """The same numbers with a formula in addition, at its optimum."""
         spreads = self.at.optimum.hyper[HYPERPARAMETERS : HYPERPARAMETERS + len(self.more.own_spreads)]
         at = fit_hypothesis(base, state, variants, numbers, np.concatenate([hyper, spreads]), self.more)

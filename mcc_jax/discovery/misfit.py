@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ from jaxtyping import Array
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, Point
 from ..calibrate.running import compiled_quickly
-from ..effects import Variant
 from ..effects.record import RELOAD, UNLOAD
 from .settings import WAVES
 
@@ -93,15 +92,12 @@ def functions(names: tuple[str, ...], at: Mapping[str, np.ndarray]) -> np.ndarra
     return np.concatenate([smooth * np.sqrt(1 / smooth.shape[-1]) * np.sqrt(2), *rough], -1)
 
 
-def misfit_columns(
-    variant: Variant, curve: np.ndarray, smooth: np.ndarray, siblings: Mapping[str, np.ndarray]
-) -> np.ndarray:
+def misfit_columns(curve: np.ndarray, smooth: np.ndarray, siblings: Iterable[np.ndarray]) -> np.ndarray:
     """Columns by which a formula may be wrong that adds a curve to the tests: towards its siblings, and smooth ones."""
     size, towards = np.linalg.norm(curve), []
-    for formula, column in siblings.items():
-        if formula != variant.name and np.any(column):
-            factor = np.copysign(size / np.linalg.norm(column), np.sum(column * curve))
-            towards.append((column * factor - curve)[..., None])
+    for column in filter(np.any, siblings):
+        factor = np.copysign(size / np.linalg.norm(column), np.sum(column * curve))
+        towards.append((column * factor - curve)[..., None])
     return np.concatenate([*towards, curve[..., None] * smooth], -1)
 
 

@@ -20,7 +20,7 @@ from ..calibrate.priors import SCALES
 from ..calibrate.running import compiled_quickly
 from ..effects import AbstractEffect, Mechanism, Need, Nuisance, Variant
 from ..law import PUNCH_AREA, signatures
-from .base import Base, State
+from .base import Base, Library, State
 from .design import design_of
 from .evidence import LinearModel, log_prior
 from .settings import LENGTH_FACTORS, NOISE_FACTORS
@@ -54,7 +54,7 @@ class Candidates:
     each: tuple[Candidate, ...]
     columns: np.ndarray  # signatures at the base law, per smallest plausible amplitude
 
-    def of(self, library: Mapping[str, Mechanism]) -> Candidates:
+    def of(self, library: Library) -> Candidates:
         """Those of a library."""
         known = [variant for mechanism in library.values() for variant in mechanism.variants]
         rows = np.array([k for k, c in enumerate(self.each) if c.variant in known], int)
@@ -76,7 +76,7 @@ class Candidates:
         return np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.each], float)
 
 
-def candidates_of(library: Mapping[str, Mechanism]) -> tuple[Candidate, ...]:
+def candidates_of(library: Library) -> tuple[Candidate, ...]:
     """All formulas of a library in its order, at every value of their grids."""
     found = []
     for variant in (v for mechanism in library.values() for v in mechanism.variants):
@@ -99,9 +99,7 @@ def located(variant: Variant) -> bool:
     return any(n.random_per_test for n in variant.nuisances)
 
 
-def untestable(
-    library: Mapping[str, Mechanism], present: frozenset[Need]
-) -> tuple[dict[str, Mechanism], list[dict[str, str]]]:
+def untestable(library: Library, present: frozenset[Need]) -> tuple[dict[str, Mechanism], list[dict[str, str]]]:
     """The mechanisms and variants whose needs the data meet; name and needs of each mechanism that has none."""
     testable: dict[str, Mechanism] = {}
     missing = []
@@ -115,9 +113,8 @@ def untestable(
     return testable, missing
 
 
-def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
-    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be: it
-    would be another name for the compliance of the frame."""
+def without_punch(library: Library, base: Base) -> dict[str, Mechanism]:
+    """The library without the width of the punch, another name for the frame's compliance unless a contact is wider."""
     diameter, tests = base.campaign.metadata.punch_diameter_um, base.tests
     ends = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1)
     travel = np.maximum(ends - np.asarray(base.state.point.zero), 0.0)
@@ -200,9 +197,7 @@ def single_integrals(score: Any, information: Any, signs: Any, largest: Any) -> 
     return logsumexp(value, axis=0) - np.log(SCALES)
 
 
-def pair_integrals(
-    gram: np.ndarray, score: np.ndarray, a: np.ndarray, b: np.ndarray, signs: np.ndarray, largest: np.ndarray
-) -> np.ndarray:
+def pair_integrals(gram: Any, score: Any, a: np.ndarray, b: np.ndarray, signs: Any, largest: Any) -> np.ndarray:
     """Log integral over two amplitudes, for many pairs of rows `a` and `b`."""
     found = []
     for one, two in itertools.product(np.linspace(0, 1, SCALES), repeat=2):
@@ -235,7 +230,7 @@ def screen(base: Base, state: State, hyper: np.ndarray, candidates: Candidates, 
     return Screen(candidates, np.array(log_null), np.array(gram), np.array(score))
 
 
-def first_order(base: Base, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism]) -> Screen:
+def first_order(base: Base, whole: Library, testable: Library) -> Screen:
     """Scores around the base law at its own hyperparameters of what of a whole library the tests can show."""
     candidates = with_signatures(base, base.state, candidates_of(whole)).of(testable)
     return screen(base, base.state, base.hyperparameters, candidates, several=False)

@@ -15,36 +15,23 @@ from .._types import Progress
 from ..calibrate.numpyro_model import Model
 from ..calibrate.running import side_by_side
 from ..campaign import Finding
-from ..effects import Mechanism, Variant
-from .base import Base
+from ..effects import Variant
+from .base import Base, Library
 from .evidence import LinearModel, log_joint, with_little_noise
 from .fit import Fitted, at_priors, fit_hypothesis, noise_models, with_likely_noise, with_other_noise
-from .hypothesis import (
-    UNLISTED,
-    Discrepancy,
-    Hypothesis,
-    Names,
-    RandomEffects,
-    fit_with_misfit,
-    random_amplitude,
-    sudden_steps,
-)
+from .hypothesis import Discrepancy, Hypothesis, Names, RandomEffects, fit_with_misfit, random_amplitude, sudden_steps
 from .misfit import coordinates, functions, general, informative, misfit_columns, scaled
 from .screen import Candidate, Screen, candidates_of, pair_integrals, screen, single_integrals, with_signatures
-from .settings import CONTENDERS, DECISIONS, STRONG, VERY_STRONG
+from .settings import CONTENDERS, DECISIONS, STRONG, UNLISTED, VERY_STRONG
 
 FORMULAS, ALL_FORMULAS = 2, 8  # of each contender that are fitted where one is `VERY_STRONG`, and of the leading two
 SECONDS = 3  # second names tried next to each of the two leading ones, and pairs that lead to first order
-
-Library = Mapping[str, Mechanism]
 
 
 class Search:
     """One search: what all hypotheses share, and what was found."""
 
-    def __init__(
-        self, base: Base, library: Library, progress: Progress = lambda _: None, *, whole: Library | None = None
-    ) -> None:
+    def __init__(self, base: Base, library: Library, whole: Library, progress: Progress) -> None:
         """Fit the law alone; `library` has what is searched for, `whole` also formulas that the tests cannot show."""
         base, start = with_likely_noise(base)
         self.base, self.library, self.progress = base, library, progress
@@ -64,7 +51,7 @@ class Search:
         self.not_shared = {m: library[m] for m in library if m in differ}  # numbers differ from test to test
         self.shared = {m: library[m] for m in library if m not in differ}
         # Those of the whole library are computed: campaigns that can show different ones share what is compiled.
-        self.candidates = with_signatures(base, self.null.state, candidates_of(whole or library)).of(library)
+        self.candidates = with_signatures(base, self.null.state, candidates_of(whole)).of(library)
         self.screen = self.screened(self.shared)
         self.small = with_little_noise(self.null.optimum.hyper)
         self.fits: dict[tuple[int, ...], Fitted] = {}  # by the rows of the candidates in `screen`
@@ -117,8 +104,7 @@ class Search:
         return {names: v for names, v in logs.items() if len(names) < 2 or self._credible(names)}
 
     def _credible(self, names: Names) -> bool:
-        """Whether the name of a pair that explains less by itself has an amplitude that one would believe: any larger,
-        it imitates what the first name's formula misses."""
+        """Whether the lesser name of a pair has a plausible amplitude; a larger one imitates what the other misses."""
         r = self.found[names].at
         if r is None:
             return True
@@ -175,9 +161,10 @@ class Search:
         columns = self.screen.candidates.columns
 
         def columns_of(variant: Variant, curve: np.ndarray) -> np.ndarray:
-            siblings = {f: columns[..., k] for f, (_, k) in self.first_order.get(variant.mechanism, {}).items()}
+            formulas = self.first_order.get(variant.mechanism, {})
+            siblings = [columns[..., k] for name, (_, k) in formulas.items() if name != variant.name]
             smooth = functions(self.library[variant.mechanism].coordinates, self.at)
-            return misfit_columns(variant, curve, smooth, siblings)
+            return misfit_columns(curve, smooth, siblings)
 
         fit_with_misfit(self.base, one, columns_of)
 
@@ -243,8 +230,7 @@ class Search:
         return next(ks for ks, one in self.fits.items() if one is r)
 
     def leading_pairs(self) -> dict[Names, tuple[int, ...]]:
-        """The leading pairs to first order, each by its best candidates, that lead every single name by the margin: of
-        two strong effects neither need lead by itself."""
+        """The best pairs to first order that lead every single name: of two strong effects neither need lead alone."""
         a, b, value = self.screen.pairs()
         least = self.screen.singles().max() + DECISIONS.margin
         found: dict[Names, tuple[int, ...]] = {}

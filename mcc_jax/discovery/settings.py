@@ -39,6 +39,7 @@ class Decisions:
 
 DECISIONS = Decisions()
 
+UNLISTED = ("UNLISTED",)  # in place of the names of mechanisms: a discrepancy that none explains
 AT_PEAKS = "modulus_at_peaks_MPa"  # in `discovery.json`: the modulus that acts at the peaks of the tests
 POPULATION = 5  # numbers of the population, which come first in what particles share: a, log modulus, b1, b3, b5
 HYPERPARAMETERS = 8  # of the base law: four of the noise, and the spreads of b1, b3, b5 and e

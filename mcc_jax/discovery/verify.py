@@ -14,10 +14,10 @@ from ..calibrate.judgement import LARGE_MISFIT
 from ..calibrate.priors import SCALES
 from .base import Base
 from .evidence import LinearModel, marginalise
-from .hypothesis import UNLISTED, Names
+from .hypothesis import Names
 from .screen import single_integrals
 from .search import Search
-from .settings import CONTENDERS, DECISIONS, HYPERPARAMETERS, POPULATION
+from .settings import CONTENDERS, DECISIONS, HYPERPARAMETERS, POPULATION, UNLISTED
 
 CAMPAIGNS = 400  # drawn for the p value: its standard error at a level of 0.05 is 0.011
 PLACES_OF_STEPS = 24  # of a sudden step in each test
@@ -131,7 +131,7 @@ class HeldOut:
     def _gain(self, step: int) -> tuple[float, float]:
         """Log predictive density over the base law's, and its standard error (Vehtari, Gelman and Gabry 2017)."""
         gain = self.elpd[step] - self.elpd[0]
-        return float(gain.sum()), float(np.std(gain, ddof=1) * np.sqrt(len(gain))) if len(gain) > 1 else np.nan
+        return float(gain.sum()), float(np.std(gain, ddof=1) * np.sqrt(len(gain)))
 
     def objection(self, rms_um: Sequence[np.ndarray], range_um: np.ndarray) -> str | None:
         """Why what was found cannot be the answer, going by held-out particles; None if nothing speaks against it.
@@ -160,7 +160,7 @@ class HeldOut:
         chi2, steps = (self.chi2.sum(1) / self.points.sum()).tolist(), []
         for k, label in enumerate(self.labels):
             (elpd, error), each = self._gain(k), self.chi2[k] / self.points
-            half = 1.96 * float(np.std(each, ddof=1) / np.sqrt(len(each))) if len(each) > 1 else np.nan
+            half = 1.96 * float(np.std(each, ddof=1) / np.sqrt(len(each)))
             steps.append(
                 {
                     "added": label,
@@ -211,7 +211,7 @@ def held_out(search: Search, winner: Names) -> HeldOut:
     chi2, elpd = np.zeros((2, len(labels), len(everyone)))
     residual = np.zeros((len(labels), *null.data.shape))
     for i in range(len(everyone)):
-        others = np.delete(everyone, i) if len(everyone) > 1 else everyone
+        others = np.delete(everyone, i)
         without = {names: model.log_evidence(others) for names, model in every.items()}
         best = max(contestants, key=lambda names: without[names] + weight[names])
         first = winner[:1] if winner[:1] in contestants else best

@@ -20,8 +20,7 @@ from .variant import Need, Nuisance, family, row
 
 REFERENCE_TIME_S = 100.0
 SPACING = math.log(10) / 2  # of elements in ln(time): two per decade
-NORM = 27 / 4
-"""What makes the largest value of x (1 - x)^2 one."""
+NORM = 27 / 4  # makes the largest value of x (1 - x)^2 one
 
 Elements = Float[Array, " elements"]
 Spectrum = tuple[Elements, Elements, Scalar]
@@ -101,10 +100,7 @@ def _power_law(n: Scalar) -> Spectrum:
 
 
 class ViscousFlow(AbstractEffect):
-    """Steady flow: strain rate in proportion to stress, never recovered; the amplitude counts 100 s.
-
-    The memory is the integral of the driver over time.
-    """
+    """Steady flow, never recovered; the amplitude counts 100 s, the memory is the integral of the driver over time."""
 
     def driver(self, context: Context) -> Values:
         return context.stress
@@ -121,17 +117,14 @@ class ViscousFlow(AbstractEffect):
 
 
 class ViscoplasticCreep(ViscousFlow):
-    """Permanent creep, only near the largest load: with u^8, unloading by a tenth more than halves its rate.
-
-    It is logarithmic in the time spent there, or with `root` as its cube root.
-    """
+    """Permanent creep near the largest load, logarithmic in the time spent there, or with `root` as its cube root."""
 
     tau_s: Any = None
     root: float = 0.0
 
     def driver(self, context: Context) -> Values:
         square = context.load_share * context.load_share
-        return square * square * square * square
+        return square * square * square * square  # u^8: unloading by a tenth more than halves the rate
 
     def inside(self, context: Context) -> Values:
         time = jnp.log1p(context.memory / self.tau_s)

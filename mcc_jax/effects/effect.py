@@ -16,8 +16,7 @@ from ..geometry import Particle
 from .record import Context, Record
 
 Factors = tuple[Values, Values, Values]
-MIN_FACTOR = 0.05
-"""Floor of every factor, so that an amplitude far from null does not turn it negative."""
+MIN_FACTOR = 0.05  # floor of every factor, so that an amplitude far from null does not turn it negative
 
 
 class AbstractEffect(eqx.Module):

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator, Mapping
 
 from .._errors import InputError
-from . import contact, creep_and_cycles, instrument, loading, material, unloading
+from . import creep_and_cycles, instrument, loading, material, unloading
 from .variant import Mechanism, Variant
 
 
@@ -33,8 +33,8 @@ class _Library(Mapping[str, Mechanism]):
 LIBRARY: Mapping[str, Mechanism] = _Library(
     instrument.FRAME, instrument.DRIFT, creep_and_cycles.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE,
     material.DENSIFICATION, creep_and_cycles.HYSTERESIS, creep_and_cycles.RATCHETING, loading.HARDENING,
-    unloading.SHAPE_OF_UNLOADING, material.SIZE, material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION,
-    contact.MISALIGNMENT, instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
+    unloading.SHAPE_OF_UNLOADING, material.SIZE, material.SHAPE, loading.POP_IN, loading.TOE, loading.FRICTION,
+    loading.MISALIGNMENT, instrument.SINK_IN, unloading.REVERSAL, material.HUMIDITY,
 )  # fmt: skip
 """The mechanisms known by name, in a fixed order; `dict(LIBRARY)` is a copy to add to."""
 

@@ -92,11 +92,13 @@ def reload_progress(force: Values, reload_from: Values, peak_force: Values) -> V
     return jnp.where(some & (share < 1), jnp.where(share > 0, share, 0.0), 1.0)
 
 
-def first_point(dtype: jnp.dtype, relative_humidity: Scalar | None = None) -> Record:
-    """A test that has not begun: no force, no time."""
+def first_point(dtype: jnp.dtype, humidity: Scalar | None = None, time: Scalar | None = None) -> Record:
+    """A test that has not begun: no force; time zero and the reference humidity unless they are given."""
     zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    humidity = jnp.asarray(REFERENCE_HUMIDITY_PERCENT, dtype) if relative_humidity is None else relative_humidity
-    return Record(zero, zero, none + LOAD, none + LOAD, none, zero, zero, zero, zero, zero, humidity)
+    humidity = jnp.asarray(REFERENCE_HUMIDITY_PERCENT, dtype) if humidity is None else humidity
+    return Record(
+        zero, zero if time is None else time, none + LOAD, none + LOAD, none, zero, zero, zero, zero, zero, humidity
+    )
 
 
 def follow(before: Record, peak_force: Scalar, force: Scalar, time: Scalar) -> Record:
@@ -142,8 +144,7 @@ def clean_record(
     force, time = arguments.path(force, "force"), arguments.path(time, "time")
     arguments.same_length(force=force, time=time)
     humidity = None if relative_humidity is None else scalar(relative_humidity)
-    virgin = eqx.tree_at(lambda r: r.time, first_point(force.dtype, humidity), time[0])
-    start = virgin if before is None else before
+    start = first_point(force.dtype, humidity, time[0]) if before is None else before
     highest = jnp.zeros_like(force[0]) if peak_force is None else peak_force
 
     def one(carry, now):

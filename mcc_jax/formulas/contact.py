@@ -28,10 +28,8 @@ from .._types import Flag, Path, Scalar, Values
 
 SHARE = 3 * math.pi / 8
 r"""Largest :math:`\Delta F'/F_P`. Elastic energy is :math:`\tfrac{4}{3\pi} F_P \Delta`; with it :math:`F^2/(2F')`."""
-PEAKS = 256
-"""Peaks, evenly spread, at which `first_gain` compares what is lost with the peak before."""
-HALLEY_STEPS = 4
-"""Meet the last digit in every case tried: k3 = 0, loss of monotonicity, peaks approached to 1e-14, 13 decades."""
+PEAKS = 256  # evenly spread, at which `first_gain` compares what is lost with the peak before
+HALLEY_STEPS = 4  # meet the last digit in every case tried: k3 = 0, loss of monotonicity, peaks approached to 1e-14
 
 Flags = Bool[Array, "..."]
 
@@ -162,8 +160,7 @@ def _energy_ratio_jvp(primals, tangents):
 
 class Recovered(NamedTuple):
     """What full release from a peak gives back, as a quotient; whether the peak carries force, whether the limit holds,
-    and there the second of its two terms (`steep`).
-    """
+    and there the second of its two terms (`steep`)."""
 
     top: Values
     bottom: Values

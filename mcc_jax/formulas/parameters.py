@@ -11,7 +11,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._format import described, in_words, table
 from .._numerics import compiled_whole, cotangent_barrier, recompute
@@ -20,19 +19,16 @@ from ..arguments import finite, member, positive
 from ..geometry import Particle, plastic_shape_factor
 from .contact import Contact, Quintic, reached, stress_ratio
 
-AnyShape = Float[Array, "..."]
-
-AREA = 1e-3 * jnp.pi / 4
-"""Effective area over the diameter squared, times what makes mN of MPa um^2."""
+AREA = 1e-3 * jnp.pi / 4  # effective area over the diameter squared, times what makes mN of MPa um^2
 PUNCH_AREA = 1.43
 """c^2 of Storakers for perfect plasticity. It equals the paper's `a` by coincidence: never share one constant."""
 
 
-def _checked(name: str, **options: bool) -> Callable[[ScalarLike], Scalar]:
-    """The converter of a number of the law, which refuses a plain number out of its range."""
+def checked(check: Callable[..., None], name: str, **options: bool) -> Callable[[ScalarLike], Scalar]:
+    """The converter of a number of the law, which refuses a plain number that a check of `arguments` refuses."""
 
     def convert(value: ScalarLike) -> Scalar:
-        positive(value, name, plain=True, **options)
+        check(value, name, **options)
         return scalar(value)
 
     return convert
@@ -54,9 +50,9 @@ class Plastic(eqx.Module):
         Bommireddy et al. (2018), eq. 16, where they are C1, C2, C3 in MPa, MPa^-3, MPa^-5.
     """
 
-    C1: Scalar = eqx.field(converter=_checked("a plastic coefficient"))
-    C3: Scalar = eqx.field(converter=_checked("the softening coefficient C3", zero=True))
-    C5: Scalar = eqx.field(converter=_checked("a plastic coefficient"))
+    C1: Scalar = eqx.field(converter=checked(positive, "a plastic coefficient", plain=True))
+    C3: Scalar = eqx.field(converter=checked(positive, "the softening coefficient C3", zero=True, plain=True))
+    C5: Scalar = eqx.field(converter=checked(positive, "a plastic coefficient", plain=True))
 
     __repr__ = described()
 
@@ -86,16 +82,16 @@ class Plastic(eqx.Module):
         """
         return self.curve.is_monotone
 
-    def stress(self, x: AnyShape) -> AnyShape:
+    def stress(self, x: Values) -> Values:
         """Stress [MPa] at the scaled strain `x` = eta_p eps >= 0, never below zero."""
         return self.curve.loading(x)
 
-    def tangent(self, x: AnyShape) -> AnyShape:
+    def tangent(self, x: Values) -> Values:
         r"""Slope :math:`d\sigma/dx = C_1 - 3 C_3^3 x^2 + 5 C_5^5 x^4` [MPa]."""
         return self.curve.tangent(x)
 
     @compiled_whole
-    def strain(self, stress: AnyShape) -> AnyShape:
+    def strain(self, stress: Values) -> Values:
         """Scaled strain at which the stress [MPa] is first reached from the virgin state; 0 for stress <= 0.
 
         Of a law that is not monotone it jumps over peak and trough. Derivatives by the implicit-function rule.
@@ -130,9 +126,8 @@ class Unloading(enum.Enum):
     @property
     def constant(self) -> float:
         """The numerical factor k of the form."""
-        return {"printed": 4.12, "punch": 256 * PUNCH_AREA / (9 * math.pi**2), "punch_exact": 4 * PUNCH_AREA}[
-            self.value
-        ]
+        constants = {"printed": 4.12, "punch": 256 * PUNCH_AREA / (9 * math.pi**2), "punch_exact": 4 * PUNCH_AREA}
+        return constants[self.value]
 
     @property
     def stress_power(self) -> int:
@@ -161,17 +156,12 @@ class StrainScaling(enum.Enum):
         return {"raw": 0, "contact": 1, "master": 3}[self.value]
 
 
-def _shape(value: ScalarLike) -> Scalar:
-    finite(value, "a, the geometric parameter [-],")
-    return scalar(value)
-
-
 class Formulas(eqx.Module):
     """The law's parameters, which effects may change, and its closed formulas; attributes as of `MccLaw`."""
 
     plastic: Plastic
-    a: Scalar = eqx.field(converter=_shape)
-    effective_modulus: Scalar = eqx.field(converter=_checked("the effective modulus [MPa]"))
+    a: Scalar = eqx.field(converter=checked(finite, "a, the geometric parameter [-],"))
+    effective_modulus: Scalar = eqx.field(converter=checked(positive, "the effective modulus [MPa]", plain=True))
     unloading: Unloading = eqx.field(
         static=True, converter=lambda value: member(value, Unloading, "unloading"), default=Unloading.PRINTED
     )
@@ -222,12 +212,12 @@ class Formulas(eqx.Module):
         return Contact(*numbers, power=self.unloading.stress_power)
 
     @compiled_whole
-    def loading_stress(self, particle: Particle, strain: AnyShape) -> AnyShape:
+    def loading_stress(self, particle: Particle, strain: Values) -> Values:
         """Stress [MPa] of plastic loading at the strain [-]."""
         return self.plastic.stress(self.shape_factor(particle) * strain)
 
     @compiled_whole
-    def recoverable_strain(self, particle: Particle, strain_max: AnyShape) -> AnyShape:
+    def recoverable_strain(self, particle: Particle, strain_max: Values) -> Values:
         r"""Strain :math:`\delta` [-] recovered on full release from the largest strain :math:`\epsilon_P` [-].
 
         .. math:: \delta^2 = \frac{(\sigma_P / \bar E)^n}{k\, \eta_p^p\, \epsilon_P}, \qquad
@@ -238,7 +228,7 @@ class Formulas(eqx.Module):
         return particle.strain(self.contact(particle).recovered(particle.displacement(strain_max)).displacement)
 
     @compiled_whole
-    def unloading_stress(self, particle: Particle, strain: AnyShape, strain_max: AnyShape) -> AnyShape:
+    def unloading_stress(self, particle: Particle, strain: Values, strain_max: Values) -> Values:
         """Stress [MPa] on the elastic branch that starts at `strain_max`."""
         recovered = self.recoverable_strain(particle, strain_max)
         carries = recovered > 0
@@ -260,10 +250,9 @@ class Formulas(eqx.Module):
 
 # ---- the four numbers of a contact from law and size -----------------------------------------------------------------
 
+# Of unloading, of the shape factor, and A / L^2, which turns MPa and the unit of length into the unit of force.
 Form = tuple[Unloading, StrainScaling, float]
-"""Unloading, shape factor, and A / L^2, which turns MPa and the unit of length into the unit of force."""
-Size = tuple[Scalar, Scalar, Scalar]
-"""Shape factor eta_p, length L, and 1 / L, for derivatives a function of L."""
+Size = tuple[Scalar, Scalar, Scalar]  # shape factor eta_p, length L, and 1 / L, for derivatives a function of L
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -12,7 +12,7 @@ directions, and passes both on by the chain rule.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,19 +27,8 @@ from .._types import Path, Scalar
 from ..effects import AbstractEffect, Context, Record
 from ..formulas import Formulas, Plastic, StrainScaling, Unloading
 from ..geometry import Particle
+from . import response
 from .mcc import MccLaw
-from .response import (
-    NEWTON_STEPS,
-    additions,
-    base_strain,
-    initial_memory,
-    newton_step,
-    peak_displacement,
-    peak_forces,
-    released,
-    slope_at,
-    stress_at,
-)
 
 DIRECTIONS = 12  # as many as two effects with two further numbers each need; fewer are padded, to share programs
 INSIDE = "modify", "loading", "stiffness"  # hooks that act on the law itself
@@ -56,8 +45,7 @@ def padded(directions: int) -> int:
 
 class Numbers(NamedTuple):
     """Of every test: C1, C3, C5, a and the effective modulus; the force of every point and that from which its branch
-    starts [mN]; amplitude and further numbers of each effect.
-    """
+    starts [mN]; amplitude and further numbers of each effect."""
 
     law: Any
     force: Any
@@ -65,28 +53,18 @@ class Numbers(NamedTuple):
     effects: tuple[Any, ...]
 
 
-@dataclass(frozen=True)
-class Formula:
+class Formula(NamedTuple):
     """An effect without its numbers, and the names of the fields that are its numbers, the amplitude first."""
 
-    effect: AbstractEffect
+    effect: AbstractEffect  # without a label, which would keep equal programs apart
     names: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "effect", replace(self.effect, label=""))  # which would keep equal programs apart
 
-
-Forms = tuple[Unloading, StrainScaling]
-"""Of unloading, and of how the shape factor enters it."""
+Forms = tuple[Unloading, StrainScaling]  # of unloading, and of how the shape factor enters it
 
 
 def along(
-    forms: Forms,
-    formulas: Sequence[Formula],
-    particle: Particle,
-    record: Record,
-    numbers: Numbers,
-    directions: Numbers,
+    forms: Forms, formulas: Sequence[Formula], particle: Particle, record: Record, numbers: Numbers, directions: Numbers
 ) -> tuple[Float[Array, "tests points"], Float[Array, "along tests points"]]:
     """Displacement [um] of virgin particles along their tests, and its derivatives along directions of all numbers.
 
@@ -115,14 +93,13 @@ def along(
             return [one for one, _ in found], [one for _, one in found]
 
         strain = _start(forms, law, loads, particle, factors(strain)[0])
-        for _ in range(NEWTON_STEPS):
-            strain, step = _newton(forms, law, loads, particle, strain, *factors(strain))
+        for _ in range(response.NEWTON_STEPS):
+            strain, step = _newton(forms, law, loads, particle, (strain, *factors(strain)))
             if not arguments.is_traced(step) and step < SETTLED:
                 break
-        reached, d_reached = _reached(forms, law, loads, *tests, strain, *factors(strain), (d_law, d_loads))
-        context, d_context = _staged(
-            _released, (law, loads, reached, []), (d_law, d_loads, d_reached, []), tests, forms
-        )
+        reached, d_reached = _reached(forms, law, loads, tests, (strain, *factors(strain)), (d_law, d_loads))
+        given, directed = (law, loads, reached, []), (d_law, d_loads, d_reached, [])
+        context, d_context = _staged(_released, given, directed, tests, forms)
     else:
         context, d_context = _staged(_base, (law, loads), (d_law, d_loads), tests, forms)
     if stiffening := with_hook("stiffness"):
@@ -159,7 +136,7 @@ def _loaded(
 ) -> tuple[Particle, Formulas, Record, Path]:
     """What a context begins with: particle, law, record, and the force from which every branch starts."""
     record = eqx.tree_at(lambda r: (r.force, r.peak), record, loads)
-    return particle, _law(law, forms), record, peak_forces(record, jnp.zeros_like(particle.D3))
+    return particle, _law(law, forms), record, response.peak_forces(record, jnp.zeros_like(particle.D3))
 
 
 def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
@@ -172,7 +149,7 @@ def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple
 def _released(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
     law, loads, reached, factors = given
     particle, formulas, record, highest = _loaded(law, loads, particle, record, forms)
-    context = released(Context(particle, formulas, record, highest, reached, reached, reached), factors)
+    context = response.released(Context(particle, formulas, record, highest, reached, reached, reached), factors)
     return reached, context.recoverable, context.displacement
 
 
@@ -191,8 +168,8 @@ def _hook(given: Any, particle: Particle, record: Record, static: Any, effect: A
     context = Context(*loaded, *moved)
     if which == "stiffness":
         return effect.stiffness(context)
-    before = initial_memory((effect,), jnp.zeros_like(particle.D3))
-    return additions((effect,), eqx.tree_at(lambda m: m.point.time, before, record.time[0]), context)[-1]
+    before = response.initial_memory((effect,), jnp.zeros_like(particle.D3), time=record.time[0])
+    return response.additions((effect,), before, context)[-1]
 
 
 def _stress(particle: Particle, loads: Any) -> Path:
@@ -204,60 +181,49 @@ def _stress(particle: Particle, loads: Any) -> Path:
 def _start(forms: Forms, law: Array, loads: Any, particle: Particle, factors: list[Any]) -> Array:
     """Strain of loading at every force, the factors taken as independent of strain."""
     return jax.vmap(
-        lambda law, loads, particle, f: base_strain(_law(law, forms), particle, _stress(particle, loads), f)
+        lambda law, loads, particle, f: response.base_strain(_law(law, forms), particle, _stress(particle, loads), f)
     )(law, loads, particle, factors)
 
 
 @compiled
-def _newton(
-    forms: Forms, law: Array, loads: Any, particle: Particle, strain: Array, factors: list[Any], slopes: list[Any]
-) -> tuple[Array, Array]:
+def _newton(forms: Forms, law: Array, loads: Any, particle: Particle, there: Any) -> tuple[Array, Array]:
     """A step of Newton's method, and how long it was at most, relative to the strain."""
+    strain, factors, slopes = there
 
     def one(law: Array, loads: Any, particle: Particle, *at: Any) -> Array:
-        return newton_step(_law(law, forms), particle, _stress(particle, loads), *at)
+        return response.newton_step(_law(law, forms), particle, _stress(particle, loads), *at)
 
     new = jax.vmap(one)(law, loads, particle, strain, factors, jax.tree.map(lambda x: x[-1], slopes))
     return new, jnp.max(jnp.abs(new - strain) / jnp.where(strain > 0, strain, 1.0))
 
 
 @compiled
-def _reached(
-    forms: Forms,
-    law: Array,
-    loads: Any,
-    particle: Particle,
-    record: Record,
-    strain: Array,
-    factors: list[Any],
-    slopes: list[Any],
-    directions: Any,
-) -> tuple[Array, Array]:
+def _reached(forms: Forms, law: Array, loads: Any, tests: Any, there: Any, directions: Any) -> tuple[Array, Array]:
     """Largest displacement so far, and its derivatives by the implicit-function rule at the strain of loading."""
+    particle, (strain, factors, slopes) = tests[0], there
 
     def residual(given: Any, particle: Particle, strain: Array, _: Any) -> Array:
         law, loads, factors = given
-        return stress_at(_law(law, forms), particle, strain, factors) - _stress(particle, loads)
+        return response.stress_at(_law(law, forms), particle, strain, factors) - _stress(particle, loads)
 
     def peak(given: Any, particle: Particle, record: Record, _: Any) -> Array:
         strain, *loads = given
         _, _, record, highest = _loaded(law[0], loads, particle, record, forms)
-        return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3))
+        return response.peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3))
 
     off, change = _staged(residual, (law, loads, factors), (*directions, slopes), (particle, strain), None)
     by_strain = jax.tree.map(lambda x: x[-1], slopes)
-    slope = jax.vmap(lambda law, *at: slope_at(_law(law, forms), *at))(law, particle, strain, factors, by_strain)
+    slope_at = jax.vmap(lambda law, *at: response.slope_at(_law(law, forms), *at))
+    slope = slope_at(law, particle, strain, factors, by_strain)
     given, along = (strain - off / slope, *loads), (-change / slope[None], *directions[1])
-    return _staged(peak, given, along, (particle, record), None)
+    return _staged(peak, given, along, tests, None)
 
 
 # ---- every effect at its null ----------------------------------------------------------------------------------------
 
 
-def signatures(
-    base: MccLaw, particle: Particle, record: Record, effects: Sequence[AbstractEffect]
-) -> Float[Array, "effects steps"]:
-    r"""Derivatives of the displacement by the amplitude of each effect [um per unit], all amplitudes being zero.
+def signatures(base: MccLaw, particle: Particle, record: Record, effects: Sequence[AbstractEffect]) -> Array:
+    r"""Derivatives of the displacement by the amplitude of each effect at zero [um per unit], shape (effects, steps).
 
     The same as one `jax.jvp` of `base.with_effects(effect).respond` per effect, at a fraction of what that takes to
     compile: at the null every effect acts through its own first-order change of parameters, loading strain, modulus and
@@ -273,7 +239,7 @@ def signatures(
     law = replace(base, effects=())
     context = law.context(particle, record)
     strain, zero_um = _virgin_strain(law, context), jnp.zeros_like(particle.D3)
-    slope = slope_at(law, particle, strain, [], [])
+    slope = response.slope_at(law, particle, strain, [], [])
 
     def changes(effect: AbstractEffect) -> tuple[Any, Path]:
         """First-order change of parameters, loading strain and modulus if it acts there, and of what is added."""
@@ -283,12 +249,13 @@ def signatures(
             own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
             changed = eqx.filter(own.modify(law, particle, record), eqx.is_inexact_array) if inside else None
             factors = own.loading(law, particle, record, strain) if loads else None
-            start = eqx.tree_at(lambda m: m.point.time, initial_memory((own,), zero_um), record.time[0])
-            return changed, factors, own.stiffness(context) if inside else None, additions((own,), start, context)[-1]
+            start = response.initial_memory((own,), zero_um, time=record.time[0])
+            added = response.additions((own,), start, context)[-1]
+            return changed, factors, own.stiffness(context) if inside else None, added
 
         zero = jnp.zeros_like(effect.amplitude)
         changed, factors, stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
-        shift = -stress_at(law, particle, strain, [factors]) / slope if loads else jnp.zeros_like(strain)
+        shift = -response.stress_at(law, particle, strain, [factors]) / slope if loads else jnp.zeros_like(strain)
         return (changed, shift, stiffness) if inside else None, added
 
     groups: dict[object, list[int]] = {}
@@ -309,10 +276,10 @@ def signatures(
     if directions:
         parameters, rest = eqx.partition(law, eqx.is_inexact_array)
 
-        def response(parameters: Any, shift: Path, stiffness: Path) -> Path:
+        def displaced(parameters: Any, shift: Path, stiffness: Path) -> Path:
             return _response(eqx.combine(parameters, rest), context, shift, stiffness)
 
-        _, push = jax.linearize(response, parameters, jnp.zeros_like(strain), jnp.ones_like(strain))
+        _, push = jax.linearize(displaced, parameters, jnp.zeros_like(strain), jnp.ones_like(strain))
         along = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *directions)
         rows.append(jax.vmap(push)(*along) + jnp.concatenate(further))
     return jnp.concatenate(rows)[np.argsort(order)]
@@ -320,12 +287,12 @@ def signatures(
 
 def _virgin_strain(law: Formulas, context: Context) -> Path:
     """Strain of virgin loading at every force, whatever was before."""
-    return base_strain(law, context.particle, _stress(context.particle, (context.record.force,)))
+    return response.base_strain(law, context.particle, _stress(context.particle, (context.record.force,)))
 
 
 def _response(law: Formulas, context: Context, shift: Path, stiffness: Path) -> Path:
     """Displacement of a virgin particle whose loading strain is shifted and whose modulus has a factor."""
     particle, record, highest = context.particle, context.record, context.peak_force
     strain = _virgin_strain(law, context) + shift
-    peak = peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3))
-    return released(Context(particle, law, record, highest, *(peak,) * 3), [stiffness]).displacement
+    peak = response.peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3))
+    return response.released(Context(particle, law, record, highest, *(peak,) * 3), [stiffness]).displacement

@@ -19,19 +19,10 @@ from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record, cl
 from ..effects.record import first_point
 from ..formulas import Contact, Formulas, first_gain
 from ..geometry import Particle
-from .response import (
-    Memory,
-    additions,
-    context_along,
-    describe,
-    factor_at_peak,
-    folded,
-    force_at,
-    given_effects,
-    initial_memory,
-    peak_forces,
-)
+from . import response
 
+Time = Scalar | None  # [s]; None means a test in which no time passes
+Times = Path | None
 TESTED_STRAIN = 0.67
 """Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
 
@@ -65,41 +56,32 @@ class AbstractContactLaw[State](eqx.Module):
         """State of a particle that was never loaded."""
 
     @abc.abstractmethod
-    def step(
-        self, particle: Particle, state: State, displacement: Scalar, time: Scalar | None = None
-    ) -> tuple[State, Scalar]:
+    def step(self, particle: Particle, state: State, displacement: Scalar, time: Time = None) -> tuple[State, Scalar]:
         """Force [mN] at the platen displacement [um] at the time [s], and the state after it."""
 
     @abc.abstractmethod
-    def step_load(
-        self, particle: Particle, state: State, force: Scalar, time: Scalar | None = None
-    ) -> tuple[State, Scalar]:
+    def step_load(self, particle: Particle, state: State, force: Scalar, time: Time = None) -> tuple[State, Scalar]:
         """Platen displacement [um] under the force [mN] at the time [s], and the state after it."""
 
-    def path(
-        self, particle: Particle, state: State, displacement: Path, time: Path | None = None
-    ) -> tuple[State, Path]:
+    def path(self, particle: Particle, state: State, displacement: Path, time: Times = None) -> tuple[State, Path]:
         """Forces [mN] along a path of displacements [um] at times [s], by `lax.scan` of `step`."""
         return _scan(self.step, particle, state, displacement, time)
 
-    def path_load(self, particle: Particle, state: State, force: Path, time: Path | None = None) -> tuple[State, Path]:
+    def path_load(self, particle: Particle, state: State, force: Path, time: Times = None) -> tuple[State, Path]:
         """Displacements [um] along a path of forces [mN] at times [s], by `lax.scan` of `step_load`."""
         return _scan(self.step_load, particle, state, force, time)
 
 
-def _scan(step: Callable[..., Any], particle: Particle, state: Any, path: Path, time: Path | None) -> Any:
+def _scan(step: Callable[..., Any], particle: Particle, state: Any, path: Path, time: Times) -> Any:
     """A law that knows no time need not have it among its arguments."""
     along = (path,) if time is None else (path, time)
     return jax.lax.scan(lambda past, now: step(particle, past, *now), state, along)
 
 
 class History(eqx.Module):
-    """What a particle remembers: its largest platen displacement [um], and what effects remember, None without any.
+    """What a particle remembers: its largest platen displacement [um], and what effects remember, None without any."""
 
-    The displacement is that of the law itself, without what effects add.
-    """
-
-    displacement_max: Scalar = eqx.field(converter=scalar)
+    displacement_max: Scalar = eqx.field(converter=scalar)  # of the law itself, without what effects add
     memory: Any = None
 
     __repr__ = described(displacement_max="um")
@@ -154,10 +136,10 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         Bommireddy et al. (2018), eqs. 16, 23 and 24.
     """
 
-    effects: tuple[AbstractEffect, ...] = eqx.field(converter=given_effects, default=())
+    effects: tuple[AbstractEffect, ...] = eqx.field(converter=response.given_effects, default=())
 
     def _rows(self) -> list[tuple[str, str]]:
-        return [*super()._rows(), *(("effect", describe(effect)) for effect in self.effects)]
+        return [*super()._rows(), *(("effect", response.describe(effect)) for effect in self.effects)]
 
     @property
     def is_valid(self) -> Flag:
@@ -171,9 +153,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
 
     def with_effects(self, *effects: Any) -> MccLaw:
         """The law with further effects: by name, "mechanism" or "mechanism:variant", or as a `Variant`, both with the
-        middle of its plausible range; or built with another amplitude.
-        """
-        return self._with((*self.effects, *given_effects(effects)))
+        middle of its plausible range; or built with another amplitude."""
+        return self._with((*self.effects, *response.given_effects(effects)))
 
     def of_particle(self) -> MccLaw:
         """The law without what belongs to the instrument (frame, drift, platens)."""
@@ -200,11 +181,11 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def init(self, particle: Particle, relative_humidity: Scalar | None = None) -> History:
         """A virgin particle at the beginning of its test; relative humidity [%], the reference if None."""
         zero = jnp.zeros_like(particle.D3)
-        return History(zero, initial_memory(self.effects, zero, relative_humidity) if self.effects else None)
+        return History(zero, response.initial_memory(self.effects, zero, relative_humidity) if self.effects else None)
 
     @compiled_whole
     def step(
-        self, particle: Particle, state: History, displacement: Scalar, time: Scalar | None = None
+        self, particle: Particle, state: History, displacement: Scalar, time: Time = None
     ) -> tuple[History, Scalar]:
         """Force [mN] at the platen displacement [um] (negative: not yet touching) and time [s], and the history after.
 
@@ -215,15 +196,13 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             # What one MPa takes is a scale for a particle that was never loaded.
             scale = jnp.maximum(state.memory.peak_force, particle.force(jnp.ones_like(displacement)))
             arguments = (self, particle, state, time)
-            force = force_at(_moved, arguments, displacement, scale)
+            force = response.force_at(_moved, arguments, displacement, scale)
             return self.step_load(particle, state, force, time)[0], force
         peak, force = self.contact(particle).step(state.displacement_max, displacement)
         return History(peak), force
 
     @compiled_whole
-    def step_load(
-        self, particle: Particle, state: History, force: Scalar, time: Scalar | None = None
-    ) -> tuple[History, Scalar]:
+    def step_load(self, particle: Particle, state: History, force: Scalar, time: Time = None) -> tuple[History, Scalar]:
         """Platen displacement [um] under the force [mN] at the time [s], and the history after it.
 
         A force <= 0 means out of contact: the displacement stays where the platen left the particle.
@@ -235,9 +214,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         return History(peak), displacement
 
     @compiled_whole
-    def path(
-        self, particle: Particle, state: History, displacement: Path, time: Path | None = None
-    ) -> tuple[History, Path]:
+    def path(self, particle: Particle, state: History, displacement: Path, time: Times = None) -> tuple[History, Path]:
         """Forces [mN] along a path of displacements [um] at times [s].
 
         Without effects in closed form over the running maximum, with them by `lax.scan` of `step`.
@@ -248,9 +225,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         return History(peak), force
 
     @compiled_whole
-    def path_load(
-        self, particle: Particle, state: History, force: Path, time: Path | None = None
-    ) -> tuple[History, Path]:
+    def path_load(self, particle: Particle, state: History, force: Path, time: Times = None) -> tuple[History, Path]:
         """Displacements [um] along a clean path of forces [mN] at times [s], in closed form over the running maximum.
 
         A scan follows the effects' memories only. For measured, noisy forces make a `Record` and use `respond`.
@@ -266,26 +241,25 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
 
     def respond(self, particle: Particle, record: Record) -> Path:
         """Displacement [um] of a virgin particle along a record: what a fit compares with the measurement."""
-        state = self.init(particle)
+        zero = jnp.zeros_like(particle.D3)
         if self.effects:
-            state = eqx.tree_at(lambda s: s.memory.point.time, state, record.time[0])
-            return self._along(particle, state, record)[1]
-        zero = state.displacement_max
-        return self.contact(particle).under(zero, record.force, peak_forces(record, zero))[1]
+            memory = response.initial_memory(self.effects, zero, time=record.time[0])
+            return self._along(particle, History(zero, memory), record)[1]
+        return self.contact(particle).under(zero, record.force, response.peak_forces(record, zero))[1]
 
     def context(self, particle: Particle, record: Record) -> Context:
         """What effects see along a record, from a virgin particle: the law with modified parameters."""
         zero = jnp.zeros_like(particle.D3)
-        return context_along(self, self.effects, particle, zero, record, peak_forces(record, zero))
+        return response.context_along(self, self.effects, particle, zero, record, response.peak_forces(record, zero))
 
     def _along(self, particle: Particle, state: History, record: Record) -> tuple[History, Path]:
         """The history and the displacements [um] after the points of a record, with effects."""
-        highest = peak_forces(record, state.memory.peak_force)
-        context = context_along(self, self.effects, particle, state.displacement_max, record, highest)
-        own, drivers, added = additions(self.effects, state.memory, context)
+        highest = response.peak_forces(record, state.memory.peak_force)
+        context = response.context_along(self, self.effects, particle, state.displacement_max, record, highest)
+        own, drivers, added = response.additions(self.effects, state.memory, context)
         last = record, highest, context.peak_displacement
         point, peak_force, peak = jax.tree.map(lambda x: x[-1] if x.ndim else x, last)
-        return History(peak, Memory(point, peak_force, own, drivers)), context.displacement + added
+        return History(peak, response.Memory(point, peak_force, own, drivers)), context.displacement + added
 
     # ---- energy ------------------------------------------------------------------------------------------------------
 
@@ -315,21 +289,19 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         closed form.
         """
         peak = jnp.where(displacement >= history.displacement_max, displacement, history.displacement_max)
-        law, at_peak = folded(self, self.effects, particle, "the energy")
+        law, at_peak = response.folded(self, self.effects, particle, "the energy")
         contact = _unloading_from(law, at_peak, particle, peak)
         whole, now = contact.stored(peak, peak - displacement)
         dissipated = contact.work(peak) - whole
         return Energy(dissipated + now, now, dissipated)
 
 
-def _unloading_from(
-    law: Formulas, at_peak: tuple[AbstractModulusAtPeak, ...], particle: Particle, peak: Scalar
-) -> Contact:
+def _unloading_from(law: Formulas, at_peak: response.AtPeak, particle: Particle, peak: Scalar) -> Contact:
     """The contact that unloads from a peak displacement [um], with the modulus that effects leave it there."""
     contact, strain = law.contact(particle), particle.strain(peak)
-    return contact.softened(factor_at_peak(at_peak, strain, law.loading_stress(particle, strain)))
+    return contact.softened(response.factor_at_peak(at_peak, strain, law.loading_stress(particle, strain)))
 
 
-def _moved(given: tuple[Any, Particle, History, Scalar | None], force: Scalar) -> Scalar:
+def _moved(given: tuple[Any, Particle, History, Time], force: Scalar) -> Scalar:
     law, particle, state, time = given
     return law.step_load(particle, state, force, time)[1]

@@ -6,31 +6,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from .._format import described
-from .._types import Scalar, ScalarLike, scalar
+from .._types import Scalar, Values
 from ..arguments import finite, positive, whole
 from ..formulas import Plastic
-
-AnyShape = Float[Array, "..."]
-
-
-def _mean(value: ScalarLike) -> Scalar:
-    finite(value, "the mean of the logarithm")
-    return scalar(value)
-
-
-def _sd(value: ScalarLike) -> Scalar:
-    positive(value, "the standard deviation of the logarithm", zero=True, plain=True)
-    return scalar(value)
+from ..formulas.parameters import checked
 
 
 class LogNormal(eqx.Module):
     r"""A log-normal quantity with mean and standard deviation of its logarithm, :math:`\log C \sim N(\mu, \tau^2)`."""
 
-    mean: Scalar = eqx.field(converter=_mean)
-    sd: Scalar = eqx.field(converter=_sd)
+    mean: Scalar = eqx.field(converter=checked(finite, "the mean of the logarithm"))
+    sd: Scalar = eqx.field(converter=checked(positive, "the sd of the logarithm", zero=True, plain=True))
 
     __repr__ = described()
 
@@ -48,7 +37,7 @@ class LogNormal(eqx.Module):
         spread = jnp.log1p(variance / mean**2)
         return cls((jnp.log(mean) - spread / 2) / order, jnp.sqrt(spread) / order)
 
-    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> AnyShape:
+    def sample(self, key: PRNGKeyArray, shape: tuple[int, ...] = ()) -> Values:
         """Independent draws."""
         return jnp.exp(self.mean + self.sd * jax.random.normal(key, shape, dtype=self.mean.dtype))
 
@@ -72,7 +61,7 @@ class PlasticPopulation(eqx.Module):
         """The law with every coefficient at its median exp(mu)."""
         return Plastic(jnp.exp(self.C1.mean), jnp.exp(self.C3.mean), jnp.exp(self.C5.mean))
 
-    def stress_sd(self, x: AnyShape) -> AnyShape:
+    def stress_sd(self, x: Values) -> Values:
         """Standard deviation [MPa] of the stress at the scaled strain x."""
         first, third, fifth = (C.variance_of_power(k) for C, k in ((self.C1, 1), (self.C3, 3), (self.C5, 5)))
         return jnp.sqrt(first * x**2 + third * x**6 + fifth * x**10)

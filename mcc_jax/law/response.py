@@ -24,6 +24,7 @@ from ..formulas.contact import reached
 from ..geometry import Particle
 
 Effects = tuple[AbstractEffect, ...]
+AtPeak = tuple[AbstractModulusAtPeak, ...]
 HALVINGS = 64  # from the width of the bracket to below the rounding of a double
 NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effects/test_physics.py
 
@@ -62,8 +63,7 @@ def describe(effect: AbstractEffect) -> str:
 
 class Memory(eqx.Module):
     """What effects and instrument remember of a test: its latest point, the largest force so far [mN], and the memory
-    of each effect and what drove it there, None for those without one.
-    """
+    of each effect and what drove it there, None for those without one."""
 
     point: Record
     peak_force: Scalar
@@ -71,11 +71,13 @@ class Memory(eqx.Module):
     drivers: tuple[Any, ...]
 
 
-def initial_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | None = None) -> Memory:
-    """The memory of a test that has not begun; `zero` gives the precision."""
+def initial_memory(
+    effects: Effects, zero: Scalar, humidity: Scalar | None = None, time: Scalar | None = None
+) -> Memory:
+    """The memory of a test that has not begun, as `first_point`; `zero` gives the precision."""
     own = tuple(effect.start(zero) for effect in effects)
     drivers = tuple(None if memory is None else zero for memory in own)
-    return Memory(first_point(zero.dtype, relative_humidity), zero, own, drivers)
+    return Memory(first_point(zero.dtype, humidity, time), zero, own, drivers)
 
 
 # ---- along a path ----------------------------------------------------------------------------------------------------
@@ -256,9 +258,7 @@ def _with_factors(law: Formulas, like: Path, factors: Sequence[Factors]) -> Quin
 # ---- effects that are closed formulas of particle and peak -----------------------------------------------------------
 
 
-def folded(
-    law: Formulas, effects: Effects, particle: Particle, what: str
-) -> tuple[Formulas, tuple[AbstractModulusAtPeak, ...]]:
+def folded(law: Formulas, effects: Effects, particle: Particle, what: str) -> tuple[Formulas, AtPeak]:
     """The law with the parameters that effects make of it for a particle, and the effects on the modulus at a peak.
 
     `InputError` names another effect, and `what` was wanted of the law.
@@ -279,6 +279,6 @@ def folded(
     return law, at_peak
 
 
-def factor_at_peak(effects: tuple[AbstractModulusAtPeak, ...], strain: Values, stress: Values) -> Values:
+def factor_at_peak(effects: AtPeak, strain: Values, stress: Values) -> Values:
     """Product of the factors of effects on the effective modulus at a peak strain [-] and a peak stress [MPa]."""
     return math.prod((effect.factor(strain, stress) for effect in effects), start=jnp.ones_like(strain))

@@ -14,10 +14,11 @@ from mcc_jax.discovery.closure import closure
 from mcc_jax.discovery.design import Design
 from mcc_jax.discovery.evidence import Optimum
 from mcc_jax.discovery.fit import Fitted
-from mcc_jax.discovery.hypothesis import UNLISTED, Discrepancy, Hypothesis
+from mcc_jax.discovery.hypothesis import Discrepancy, Hypothesis
 from mcc_jax.discovery.misfit import general, scaled
 from mcc_jax.discovery.screen import Candidate, Candidates, Screen
 from mcc_jax.discovery.search import Search
+from mcc_jax.discovery.settings import UNLISTED
 from mcc_jax.effects import find_variant
 
 NOISE_UM = 0.05

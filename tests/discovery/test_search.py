@@ -10,9 +10,9 @@ from mcc_jax.campaign import available_data
 from mcc_jax.discovery import screen, verify
 from mcc_jax.discovery.answer import effects_of, instead_of, population_under, sets_of
 from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
-from mcc_jax.discovery.hypothesis import UNLISTED, Hypothesis
+from mcc_jax.discovery.hypothesis import Hypothesis
 from mcc_jax.discovery.search import Search
-from mcc_jax.discovery.settings import DECISIONS, VERY_STRONG
+from mcc_jax.discovery.settings import DECISIONS, UNLISTED, VERY_STRONG
 from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended
@@ -20,9 +20,13 @@ pytestmark = pytest.mark.extended
 FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
 
 
+def search_in(campaign, library):
+    return Search(base_of(campaign), library, library, lambda _: None)
+
+
 def search_of(campaign):
     library, _ = screen.untestable(FEW, available_data(campaign))
-    return Search(base_of(campaign), library).run()
+    return search_in(campaign, library).run()
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +135,7 @@ def kinked(whole, um):
 
 def test_the_misfit_of_a_formula_is_a_share_of_the_effect_that_is_left():
     """Its prior follows the amplitude: a formula that explains little lends its name to little."""
-    search = Search(base_of(kinked(cached(seed=1), 1.0)), {"toe_asperity": LIBRARY["toe_asperity"]})
+    search = search_in(kinked(cached(seed=1), 1.0), {"toe_asperity": LIBRARY["toe_asperity"]})
     search.fit_singles(["toe_asperity"], 1)
     one = search.found[("toe_asperity",)]
     search.fit_misfit(one)
@@ -147,7 +151,7 @@ def test_formulas_of_the_modulus_agree_at_the_peaks():
     """The modulus of each is that of the law at a strain of its own; at the peaks all describe the same tests."""
     whole = cached("densification_stiffening:exponential=1.0", seed=1)
     library = {"densification_stiffening": LIBRARY["densification_stiffening"]}
-    search = Search(base_of(whole), library)
+    search = search_in(whole, library)
     search.fit_singles(["densification_stiffening"], 4)
     each = [population_under(search.base, r, r.optimum.hyper, r.design) for r in search.fits.values() if r.theta[0]]
     extrapolated, at_peaks = (np.array([mean[j] for mean, _, _ in each]) for j in (1, 5))

@@ -307,15 +307,11 @@ def test_friction_and_hardening_meet_the_stress_they_say():
     def every_term(e, a):
         return LAW.loading_stress(PARTICLE, 0.2 * (e / 0.2) ** (1 + a / 2))
 
-    exponential = lambda e: np.expm1(15 * e) - 15 * e  # noqa: E731
+    grown = lambda e: np.expm1(15 * e) - 15 * e  # noqa: E731
     for mechanism, name, stress in (
         ("platen_friction", "strain", times(lambda e, a: 1 + a * e)),
         ("densification_stiffening", "locking", times(lambda e, a: 1 + a * (e / 0.5) ** 8)),
-        (
-            "densification_stiffening",
-            "locking_exponential",
-            times(lambda e, a: 1 + a * exponential(e) / exponential(0.5)),
-        ),
+        ("densification_stiffening", "locking_exponential", times(lambda e, a: 1 + a * grown(e) / grown(0.5))),
         ("finite_hardening_exponent", "all_terms", times(lambda e, a: (e / 0.2) ** (a / 2))),
         ("finite_hardening_exponent", "every_term", every_term),
         ("finite_hardening_exponent", "every_term_and_unloading", every_term),

@@ -8,33 +8,21 @@ import pytest
 from helpers import close, paper_law, paper_particle
 
 from mcc_jax import InputError, MccLaw, drive
-from mcc_jax.effects import LIBRARY, AbstractEffect, Need, Variant
+from mcc_jax.effects import LIBRARY, AbstractEffect, Variant
 from mcc_jax.geometry import Particle
 from mcc_jax.law import Plastic
 from mcc_jax.simulate import simulate_batch
 
 LAW, PARTICLE = paper_law(), paper_particle(3)
-COMPLIANCE, RATE, TAU = 0.0015, 0.01, 10.0
 # Load, hold, unload: one force a second.
 FORCE = jnp.concatenate([jnp.linspace(0.0, 150.0, 61), jnp.full(120, 150.0), jnp.linspace(147.5, 0.0, 60)])
 TIME = jnp.arange(len(FORCE), dtype=float)
 
 
-def creeping(amplitude=RATE, compliance=COMPLIANCE):
-    creep = LIBRARY["creep"]["logarithmic"].build(amplitude, tau_s=TAU)
-    return LAW.with_effects(creep, LIBRARY["frame_compliance"]["linear"].build(compliance))
-
-
-@pytest.mark.extended
-def test_a_frame_adds_compliance_times_force_and_nothing_else():
-    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
-    frame = drive(creeping(amplitude=0.0), PARTICLE, FORCE, time=TIME, control="load").displacement
-    close(frame - base, COMPLIANCE * FORCE, rel=1e-12, scale=1e-12 * float(base.max()))
-
-
 @pytest.mark.extended
 def test_batches_and_the_state_that_is_carried_on():
-    law = creeping()
+    creep, frame = LIBRARY["creep"]["logarithmic"], LIBRARY["frame_compliance"]["linear"]
+    law = LAW.with_effects(creep.build(0.01, tau_s=10.0), frame.build(0.0015))
     laws = jax.tree.map(lambda x: jnp.stack([x, x]), law)
     two = jax.tree.map(lambda x: jnp.stack([x, x]), PARTICLE)
     both = simulate_batch(laws, two, jnp.stack([FORCE, 0.5 * FORCE]), times=jnp.stack([TIME, TIME]), control="load")
@@ -51,21 +39,19 @@ def test_what_belongs_to_the_instrument_is_left_out():
 
 
 @pytest.mark.extended
-def test_a_variant_of_ones_own_goes_the_same_way():
+def test_a_variant_of_ones_own_and_a_frame_add_compliance_times_force_and_nothing_else():
     class Glue(AbstractEffect):
         """Displacement lost to a layer of glue."""
 
         def observe(self, context):
             return self.amplitude * context.force
 
-    glue = Variant(
-        "glue", "linear", Glue, "c_um_per_mN", "um/mN", 1, (1e-4, 1e-2), "d = c F", "", "", needs=(Need.HOLD,)
-    )
-    law = LAW.with_effects(glue)
-    assert law.effects[0].name == "glue:linear"
-    added = drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement
-    added = added - drive(LAW, PARTICLE, FORCE, control="load").displacement
-    close(added, glue.typical * FORCE, rel=1e-9, scale=1e-12)
+    glue = Variant("glue", "linear", Glue, "c_um_per_mN", "um/mN", 1, (1e-4, 1e-2), "d = c F", "", "")
+    assert LAW.with_effects(glue).effects[0].name == "glue:linear"
+    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
+    for variant in (glue, LIBRARY["frame_compliance"]["linear"]):
+        moved = drive(LAW.with_effects(variant), PARTICLE, FORCE, time=TIME, control="load").displacement
+        close(moved - base, variant.typical * FORCE, rel=1e-12, scale=1e-12 * float(base.max()))
 
 
 def test_effects_are_taken_by_name_and_anything_else_is_refused():
