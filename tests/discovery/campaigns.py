@@ -10,6 +10,7 @@ import numpy as np
 from mcc_jax import Plastic
 from mcc_jax.calibrate import Model
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign, Curve
+from mcc_jax.discovery import discover
 from mcc_jax.discovery.base import base_fit
 from mcc_jax.simulate import Instrument, Programme, law_for_each, paper_population, read_effect, simulate_campaign
 
@@ -81,6 +82,13 @@ def with_curves(whole, change):
 
 
 cached = functools.cache(campaign)
+
+
+@functools.cache
+def found_in(*effects, seed=0):
+    """What is found among all mechanisms of the library, once for all modules."""
+    return discover(cached(*effects, seed=seed), experiments=False)
+
 
 MODEL = Model(modulus_scatter=True)
 

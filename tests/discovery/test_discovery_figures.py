@@ -5,9 +5,8 @@ import dataclasses
 import matplotlib as mpl
 import numpy as np
 import pytest
-from campaigns import cached
+from campaigns import found_in
 
-from mcc_jax.discovery import discover
 from mcc_jax.effects import LIBRARY
 from mcc_jax.plots import discovery_figures, plot_before_after, plot_gap, plot_ranking, save_figures
 
@@ -17,8 +16,7 @@ pytestmark = pytest.mark.extended
 @pytest.fixture(scope="module")
 def found():
     """With a compliant frame and without one."""
-    tests = {"frame": cached("frame_compliance=0.004"), "null": cached(seed=1)}
-    return {kind: discover(campaign, experiments=False, posterior=False) for kind, campaign in tests.items()}
+    return {"frame": dataclasses.replace(found_in("frame_compliance=0.004"), posterior=None), "null": found_in(seed=1)}
 
 
 def texts(figure):

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from campaigns import QUICK, SINGLE, cached, campaign, snapping, subset, with_curves
+from campaigns import QUICK, SINGLE, cached, snapping, subset, with_curves
 from helpers import INSTRUMENTS
 
 from mcc_jax.campaign import Campaign, read_instrument_file
@@ -52,13 +52,6 @@ def test_an_effect_in_three_particles_only():
         assert {name for place in told["where"][:1] for name in place["particles"]} & {"1", "4", "7"}
 
 
-def test_two_effects_that_cancel():
-    """Compliance and reverse plasticity pull in opposite directions: what is left is small, not to be misnamed."""
-    told = answer(campaign("frame_compliance=0.0004", "reverse_plasticity=0.001", seed=1))
-    named = {name for names in told["candidate_set"] for name in names}
-    assert told["verdict"] != "NAMED" or named & {"frame_compliance", "platen_sink_in", "reverse_plasticity"}
-
-
 @pytest.mark.parametrize("offset_mN", [-8.0, 8.0])
 def test_a_load_cell_that_was_not_tared_is_no_physics(offset_mN):
     off_zero = with_curves(cached(programme=SINGLE), lambda c: (c.time_s, c.force_mN + offset_mN, c.displacement_um))
@@ -98,7 +91,7 @@ def nothing_but_noise():
 
 @pytest.mark.parametrize("make", [nothing_but_noise, lambda: cached("frame_compliance=0.2")])
 def test_what_is_beyond_belief_is_a_gap(make):
-    assert answer(make())["verdict"] != "NO_GAP"
+    assert answer(make(), library=FEW)["verdict"] != "NO_GAP"
 
 
 def test_loading_only():

@@ -163,16 +163,10 @@ def test_01_tabor_limit(strain, printed):
 def test_02_rigid_limit():
     """A hundredfold modulus recovers a tenth (printed) or a hundredth (punch)."""
     p = sphere(100.0)
-    for form, factor, soft, stiff in (
-        (Unloading.PRINTED, 10, "0.0158172259104", "0.00158172259104"),
-        (Unloading.PUNCH, 100, "3.95368495622e-4", "3.95368495622e-6"),
-    ):
-        law = paper_law(form)
-        peak = law.plastic.strain(jnp.array(10.0))
-        check(law.recoverable_strain(p, peak), soft)
-        check(paper_law(form, modulus=100 * EBAR).recoverable_strain(p, peak), stiff)
-        ratio = law.recoverable_strain(p, peak) / paper_law(form, modulus=100 * EBAR).recoverable_strain(p, peak)
-        close(ratio, factor, rel=1e-14)
+    for form, factor in ((Unloading.PRINTED, 10), (Unloading.PUNCH, 100)):
+        soft, stiff = paper_law(form), paper_law(form, modulus=100 * EBAR)
+        peak = soft.plastic.strain(jnp.array(10.0))
+        close(soft.recoverable_strain(p, peak) / stiff.recoverable_strain(p, peak), factor, rel=1e-14)
 
 
 @ALL_FORMS

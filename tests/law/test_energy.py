@@ -75,9 +75,8 @@ def test_balance(unloading, scaling, theta, x):
     displacements = peak - recovered * jnp.linspace(0, 1.3, 14)
     e = along(law, p, peak, displacements)
     close(e.work, e.recoverable + e.dissipated, rel=1e-15)
-    close(
-        e.dissipated, jnp.full(14, e.dissipated[0]), scale=1e-15 * float(e.work[0])
-    )  # unloading, reloading lose nothing
+    # Unloading and reloading lose nothing.
+    close(e.dissipated, jnp.full(14, e.dissipated[0]), scale=1e-15 * float(e.work[0]))
     assert jnp.all(jnp.diff(e.recoverable) <= 0)
     assert jnp.all(e.recoverable >= 0)
     assert e.recoverable[-1] == 0

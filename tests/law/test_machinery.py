@@ -85,9 +85,8 @@ def test_load_control_undoes_displacement_control(unloading, scaling, theta, x, 
     _, again = run["path"](theta, start, back)
     # On a stiff branch one rounding of the displacement is many of the force.
     law, p = unpack(theta, unloading, scaling)
-    stiffest = float(
-        jnp.max(1 / p.displacement(law.recoverable_strain(p, jnp.asarray(np.array([0.1, 0.3, 0.7]) / eta))))
-    )
+    recovered = p.displacement(law.recoverable_strain(p, jnp.asarray(np.array([0.1, 0.3, 0.7]) / eta)))
+    stiffest = float(jnp.max(1 / recovered))
     rounding = 1e-14 + 4e-16 * float(jnp.max(jnp.abs(path))) * stiffest
     close(again, force, scale=10 * rounding * max(float(force.max()), 1e-3))
 
