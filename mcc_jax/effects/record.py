@@ -96,9 +96,8 @@ def first_point(dtype: jnp.dtype, humidity: Scalar | None = None, time: Scalar |
     """A test that has not begun: no force; time zero and the reference humidity unless they are given."""
     zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     humidity = jnp.asarray(REFERENCE_HUMIDITY_PERCENT, dtype) if humidity is None else humidity
-    return Record(
-        zero, zero if time is None else time, none + LOAD, none + LOAD, none, zero, zero, zero, zero, zero, humidity
-    )
+    time = zero if time is None else time
+    return Record(zero, time, none + LOAD, none + LOAD, none, zero, zero, zero, zero, zero, humidity)
 
 
 def follow(before: Record, peak_force: Scalar, force: Scalar, time: Scalar) -> Record:
