@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,7 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
 
     jax.config.update("jax_enable_x64", True)
     import mcc_jax as mcc
-    from mcc_jax.calibrate.forward import Forms, Point
+    from mcc_jax.calibrate.forward import Forms, Point, linearise
     from mcc_jax.campaign.record import available_data
 
     campaign = mcc.read_campaign(folder)
@@ -78,7 +77,7 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
         forms = Forms(unloading, variants)
         start = jnp.asarray(forms.without_effects)
         point = Point(latent, zero, jnp.broadcast_to(start, (len(latent), len(start))))
-        return np.asarray(_linearise()(point, tests, forms).columns)[:count]
+        return np.asarray(linearise(point, tests, forms).columns)[:count]
 
     rows = [np.flatnonzero(mask) for mask in np.asarray(fit.tests.mask)]
     base = columns(())
@@ -100,15 +99,6 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
                 signatures[mechanism.name, variant.name] = ([found[i, at] for i, at in enumerate(rows)], variant.sign)
     residual = [np.asarray(fit.residual)[i, at] for i, at in enumerate(rows)]
     return Fitted(residual, own, common, coordinates, np.asarray(fit.tests.effective_diameter), signatures)
-
-
-@cache
-def _linearise() -> Any:
-    import equinox as eqx
-
-    from mcc_jax.calibrate.forward import linearise
-
-    return eqx.filter_jit(linearise)
 
 
 def eliminated(base: Fitted, sd: float, more: Sequence[list[np.ndarray]] = ()) -> tuple[np.ndarray, np.ndarray]:
