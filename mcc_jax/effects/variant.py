@@ -215,7 +215,7 @@ def family(
     known, variants = {f.name for f in fields(Variant)}, []
     defaults = {"mechanism": name, "make": make, "unit": "-", "sign": 1, "source": "ad hoc (this work)"}
     for own in rows:
-        given = defaults | common | own
+        given = {**defaults, **common, **own}
         fixed = {key: given.pop(key) for key in list(given) if key not in known}
         if given["make"].formulas:
             fixed.setdefault("formula", given["name"])
