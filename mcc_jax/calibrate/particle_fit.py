@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool
 
 from .data import Tests
 from .forward import Forms, Point, derivatives, snap
-from .running import compiled
+from .running import compiled, side_by_side
 
 # Found by trial on simulated campaigns.
 ZEROS, ZERO_REACH = 21, 0.04  # zeros of displacement that are tried, within this share of the effective diameter
@@ -118,7 +118,7 @@ def fit_particles(
         return np.where(fine, loss, np.inf), np.where(fine[:, None], g, 0.0), H
 
     def normal_equations(y: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
-        found = [of_block(y[k : k + block], rows[k : k + block]) for k in range(0, len(rows), block)]
+        found = side_by_side(lambda k: of_block(y[k : k + block], rows[k : k + block]), range(0, len(rows), block))
         return [np.concatenate(several) for several in zip(*found, strict=True)]
 
     # All starts of all particles in a row, those of one start after those of another.

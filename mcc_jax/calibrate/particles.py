@@ -27,7 +27,7 @@ from .importance import MOST_PARETO_K, ordered_resample, pareto_k, relative_scat
 from .marginal import Marginal, ParticleDraw
 from .noise import Whitening
 from .population import Population
-from .running import Blocks, compiled, side_by_side
+from .running import Blocks, Turn, compiled
 
 # Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `bench_scale.py`).
 # A particle whose weight scatters by more than this share of its mean gets several candidates per draw; of many
@@ -48,7 +48,7 @@ UNSURE = 0.3  # standard error of the correction, in standard deviations of the 
 KEPT = 4_000_000  # most draws of single particles that are kept; of very large campaigns every n-th draw
 # These change the time, and not the answer beyond rounding.
 ROWS, ROWS_OF_ACCELERATORS = 640, 40_000  # single draws of single particles at once: no more fit into a CPU's cache
-GROUP = 64  # particles that are drawn together from several candidates
+GROUP = 16  # particles that are drawn together from several candidates
 SIDE_BY_SIDE = 2  # pieces that draws are cut into on a CPU, on any number of cores
 
 
@@ -181,16 +181,15 @@ class Drawer:
         blocks, draws = self._blocks, len(np.asarray(population.a))
         chunk, same = self._chunk or draws, jnp.asarray(np.asarray(common))
 
-        def one(first: int) -> list[np.ndarray]:
+        def turn(first: int) -> Turn:
             rows = np.minimum(np.arange(first, first + chunk), draws - 1)  # the last one pads the last chunk
             keys = blocks.keys(key if common or not first else jax.random.fold_in(key, first))
             some = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), population)
-            found = blocks.all(draw_particles, (keys, self._exact), some, candidates, same)
-            return [np.asarray(v).swapaxes(0, 1) for v in found]
+            return (keys,), (some, candidates, same)
 
-        # Several processes exchange the numbers of their blocks, in one order.
-        found = (side_by_side if blocks.processes == 1 else map)(one, range(0, draws, chunk))
-        return ParticleDraws(*(cast(Any, np.concatenate(several)[:draws]) for several in zip(*found, strict=True)))
+        found = blocks.turns(draw_particles, (self._exact,), [turn(first) for first in range(0, draws, chunk)])
+        several = zip(*found, strict=True)
+        return ParticleDraws(*(np.concatenate([np.asarray(v).swapaxes(0, 1) for v in one])[:draws] for one in several))
 
     def some(
         self, key: Array, which: np.ndarray, population: Population, candidates: int, *, common: bool = False

@@ -16,7 +16,7 @@ import hashlib
 import importlib
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, cast
@@ -31,6 +31,8 @@ from .._errors import InputError
 from .._numerics import compiled as compiled
 from ..arguments import is_traced
 from .data import Tests
+
+Turn = tuple[tuple[Any, ...], tuple[Any, ...]]
 
 MAPS = Path("/proc/self/maps")
 MAX_MAPS = Path("/proc/sys/vm/max_map_count")
@@ -127,19 +129,36 @@ class Blocks:
         """`function(*particles, *shared)` of all particles, a block at a time on each device.
 
         `particles` are trees of arrays with the particles first, as those of the result; numbers without axes are left.
-        A function from `compiled` runs on all devices at once, any other calls compiled functions one after the other.
+        A function from `compiled` runs on all devices at once, any other calls compiled functions one after the other;
+        on a single device several blocks run on a thread each.
         """
+        return self.turns(function, particles, [((), shared)])[0]
+
+    def turns(self, function: Callable[..., Any], particles: tuple[Any, ...], turns: Sequence[Turn]) -> list[Any]:
+        """`function(*own, *particles, *shared)` of all particles in every turn (own, shared); `own` are further arrays
+        of the particles. The arrays of a block are placed on its device once for all turns."""
+        # Several processes exchange their numbers in one order; several devices share the cores as it is.
+        run = side_by_side if self.processes == 1 and self._mesh is None else map
         if self.number == 1 and self.size == self.count:
-            return function(*particles, *shared)
+            return list(run(lambda turn: function(*turn[0], *particles, *turn[1]), turns))
         mesh = self._mesh if hasattr(function, "__wrapped__") else None
         sharding = None if mesh is None else NamedSharding(mesh, PartitionSpec(AXIS))
 
-        def some(blocks: np.ndarray) -> Any:
+        def some(blocks: np.ndarray) -> list[Any]:
             rows = self._rows(blocks)
-            own = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows], sharding) if np.ndim(x) else x, particles)
-            return function(*own, *shared) if mesh is None else _on_all_devices(own, shared, function, mesh)
 
-        return self._gathered([some(blocks) for blocks in self._own])
+            def placed(tree: Any) -> Any:
+                return jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows], sharding) if np.ndim(x) else x, tree)
+
+            there = placed(particles)
+
+            def one(turn: Turn) -> Any:
+                own = *placed(turn[0]), *there
+                return function(*own, *turn[1]) if mesh is None else _on_all_devices(own, turn[1], function, mesh)
+
+            return list(run(one, turns))
+
+        return [self._gathered(list(parts)) for parts in zip(*run(some, self._own), strict=True)]
 
     def share(self, function: Callable[..., Any], particles: tuple[Any, ...], *shared: Any) -> Any:
         """The same, of all particles of this process in one call; for a function that cuts them into blocks itself."""
