@@ -41,22 +41,15 @@ def in_blocks[**P, R](
     """
     if block is not None:
         block = arguments.whole(block, "block, a number of contacts,", least=1)
-    one = jax.checkpoint(jax.vmap(function))
+    one = jax.checkpoint(function)
 
     def share(*arguments: Any) -> Any:
-        count = jax.tree.leaves(arguments)[0].shape[0]
-        largest = _suitable(arguments) if block is None else block
+        leaves = jax.tree.leaves(arguments)
+        count, numbers = len(leaves[0]), max(math.prod(leaf.shape[1:]) for leaf in leaves)
+        largest = block or max(1, min(CONTACTS, NUMBERS // max(numbers, 1)))
         if count <= largest:
-            return one(*arguments)
-        size = even_size(count, largest)
-        whole = count // size * size
-        parts = jax.tree.map(lambda x: x[:whole].reshape(-1, size, *x.shape[1:]), arguments)
-        found = jax.lax.map(lambda part: one(*part), parts)
-        found = jax.tree.map(lambda x: x.reshape(whole, *x.shape[2:]), found)
-        if whole == count:
-            return found
-        rest = one(*jax.tree.map(lambda x: x[whole:], arguments))
-        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), found, rest)
+            return jax.vmap(one)(*arguments)
+        return jax.lax.map(lambda contact: one(*contact), arguments, batch_size=even_size(count, largest))
 
     def call(*arguments: Any) -> Any:
         _check(arguments, len(devices or ()) or 1)
@@ -66,12 +59,6 @@ def in_blocks[**P, R](
         return jax.shard_map(share, mesh=mesh, in_specs=axis, out_specs=axis)(*arguments)
 
     return call  # pyright: ignore[reportReturnType]
-
-
-def _suitable(arguments: Any) -> int:
-    """Contacts whose largest array still has no more than `NUMBERS` numbers."""
-    each = max(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(arguments))
-    return max(1, min(CONTACTS, NUMBERS // max(each, 1)))
 
 
 def even_size(count: int, block: int) -> int:

@@ -147,15 +147,11 @@ def values(value: Any, name: str, *, shape: str = "a number or an array of numbe
 
 def path(value: Any, name: str, *, many: str = "") -> jax.Array:
     """A 1-D array of at least one point, from anything that `values` takes; `many` is the remedy for several paths."""
-    array = values(value, name, shape="a 1-D array of at least one point")
-    if array.ndim == 1 and array.size > 0:
-        return array
-    problem, remedy = f"the shape {array.shape}", many or None
-    if array.size == 0:
-        problem, remedy = "an empty one", None
-    elif array.ndim == 0:
-        problem, remedy = "one number", f"For one point write [{shown(value)}]."
-    raise InputError(f"{name}: a path is a 1-D array of at least one point, got {problem}", remedy=remedy)
+    shape = "a 1-D array of at least one point"
+    array = values(value, name, shape=shape)
+    if array.ndim != 1 or not array.size:
+        raise InputError(f"{name} must be {shape}, got the shape {array.shape}", remedy=many or None)
+    return array
 
 
 def same_length(**arrays: Any) -> int:
