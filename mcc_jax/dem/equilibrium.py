@@ -26,18 +26,14 @@ SUFFICIENT = 1e-4
 
 
 class Problem(eqx.Module):
-    """What stays as it is while the centres find their equilibrium.
-
-    Edges and wall history hold the largest overlaps before this load step. `previous` are the centres then [m], to
-    which springs of the stiffness `proximal`, mu [N/m], tie the centres.
-    """
+    """What stays as it is while the centres find their equilibrium."""
 
     packing: Packing
     walls: Walls
-    edges: Edges
-    wall_history: WallHistory
-    previous: Vectors
-    proximal: Scalar
+    edges: Edges  # with the largest overlaps before this load step
+    wall_history: WallHistory  # likewise
+    previous: Vectors  # the centres then [m]
+    proximal: Scalar  # stiffness mu of the springs that tie the centres to them [N/m]
 
 
 class Stiffness(eqx.Module):
@@ -66,10 +62,6 @@ class Stiffness(eqx.Module):
             blocks = blocks.at[a, b].add(sign * self.pairs)
         return blocks.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
-    def diagonal(self) -> Float[Array, "particles 3 3"]:
-        """Its 3 x 3 blocks on the diagonal."""
-        return self.alone.at[self.i].add(self.pairs).at[self.j].add(self.pairs)
-
     def solve(self, load: Vectors, *, definite: bool) -> Vectors:
         """Displacements under a load [N] on every particle; NaN where the matrix cannot be factorised.
 
@@ -81,7 +73,7 @@ class Stiffness(eqx.Module):
             operator = lx.MatrixLinearOperator(self.dense(), tags)
             method = lx.Cholesky() if definite else lx.LU()
             return lx.linear_solve(operator, load.reshape(-1), method, throw=False).value.reshape(n, 3)
-        inverse = jnp.linalg.inv(self.diagonal())
+        inverse = jnp.linalg.inv(self.alone.at[self.i].add(self.pairs).at[self.j].add(self.pairs))  # of the diagonal
         shape = jax.eval_shape(lambda: load)
         tags = lx.positive_semidefinite_tag
         blocks = lx.FunctionLinearOperator(lambda x: jnp.einsum("nab,nb->na", inverse, x), shape, tags)
@@ -91,22 +83,14 @@ class Stiffness(eqx.Module):
 
 
 class Balance(eqx.Module):
-    """Forces and stiffness at given centres.
+    """Forces and stiffness at given centres."""
 
-    Attributes:
-        energy: work done on all contacts and springs [J]; the net force is minus its gradient.
-        net: force on every particle, proximal spring included [N].
-        scale: mean force of the contacts that carry one, 0 if none does [N].
-        stiffness, material: of the net force, with and without what the forces do by turning (geometric stiffness).
-        on_wall: force on each wall along its normal [N].
-    """
-
-    energy: Scalar
-    net: Vectors
-    scale: Scalar
-    stiffness: Stiffness
-    material: Stiffness
-    on_wall: Float[Array, " walls"]
+    energy: Scalar  # work done on all contacts and springs [J]; the net force is minus its gradient
+    net: Vectors  # force on every particle, proximal spring included [N]
+    scale: Scalar  # mean force of the contacts that carry one, 0 if none does [N]
+    stiffness: Stiffness  # of the net force
+    material: Stiffness  # the same without what the forces do by turning (geometric stiffness)
+    on_wall: Float[Array, " walls"]  # force on each wall along its normal [N]
 
 
 def forces(problem: Problem, position: Vectors) -> tuple[Vectors, Float[Array, " walls"]]:

@@ -105,13 +105,8 @@ class _Body(eqx.Module):
     spin: Vector
 
 
-class _Contact(eqx.Module):
-    """One contact: force on the first body, its moment per unit arm, and what the contact remembers."""
-
-    force: Vector
-    moment: Vector
-    slip: Vector
-    overlap_max: Scalar
+Load = tuple[Vector, Vector, Vector]
+"""Force on the first body of a contact, its moment per unit arm, and slip after it."""
 
 
 def contact_forces(packing: Packing, motion: Motion, state: State) -> tuple[Forces, Edges, WallHistory]:
@@ -132,14 +127,14 @@ def pair_loads(motion: Motion, bodies: _Body, edges: Edges) -> tuple[Float[Array
     """Force and torque of all edges, or any part of them, summed over the particles, and what the edges remember."""
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
     between = jax.vmap(_between, (None, 0, 0, 0, 0, 0))
-    pairs = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
-    on_i, on_j = pairs.force, -pairs.force
+    (force, moment, slip), overlap_max = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
+    on_i, on_j = force, -force
     if motion.interaction.friction is not None:  # without it there is no torque to add up
-        on_i, on_j = _load(on_i, i.radius, pairs.moment), _load(on_j, j.radius, pairs.moment)
+        on_i, on_j = _load(on_i, i.radius, moment), _load(on_j, j.radius, moment)
     total = jnp.zeros((bodies.radius.shape[0], on_i.shape[1]), bodies.radius.dtype)
     total = total.at[edges.i].add(on_i).at[edges.j].add(on_j)
     total = jnp.pad(total, ((0, 0), (0, 6 - total.shape[1])))
-    return total, eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
+    return total, eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (overlap_max, slip))
 
 
 def wall_loads(
@@ -150,10 +145,10 @@ def wall_loads(
     on_wall, columns = [], []
     for w, wall in enumerate(walls):
         against = jax.vmap(_against, (None, None, 0, 0, 0))
-        contacts = against(motion, wall, bodies, history.overlap_max[:, w], history.slip[:, w])
-        load = load + _load(contacts.force, bodies.radius, contacts.moment)
-        on_wall.append(-jnp.sum(contacts.force, axis=0))
-        columns.append((contacts.overlap_max, contacts.slip))
+        (force, moment, slip), largest = against(motion, wall, bodies, history.overlap_max[:, w], history.slip[:, w])
+        load = load + _load(force, bodies.radius, moment)
+        on_wall.append(-jnp.sum(force, axis=0))
+        columns.append((largest, slip))
     if not walls:
         return load, jnp.zeros((0, 3), load.dtype), history
     return load, jnp.stack(on_wall), WallHistory(*(jnp.stack(x, axis=1) for x in zip(*columns, strict=True)))
@@ -164,7 +159,9 @@ def _load(force: Vector, radius: Scalar, moment: Vector) -> Float[Array, " 6"]:
     return jnp.concatenate([force, radius * moment])
 
 
-def _between(motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector) -> _Contact:
+def _between(
+    motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector
+) -> tuple[Load, Scalar]:
     friction = motion.interaction.friction
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
     relative = j.velocity - i.velocity
@@ -175,11 +172,11 @@ def _between(motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scal
     elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
     k = recompute(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
     mass = recompute(i.mass * j.mass / (i.mass + j.mass))
-    loaded = _contact(motion, friction, elastic, k, mass, normal, relative, slip)
-    return _Contact(*loaded, largest_overlap(overlap_max, overlap))
+    load = _contact(motion, friction, elastic, k, mass, normal, relative, slip)
+    return load, largest_overlap(overlap_max, overlap)
 
 
-def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> _Contact:
+def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> tuple[Load, Scalar]:
     friction, dtype = motion.interaction.wall_friction, body.radius.dtype
     outward = -wall.normal_at(body.position).astype(dtype)
     overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
@@ -187,8 +184,8 @@ def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip:
     if friction is not None:
         relative = relative - jnp.cross(body.radius * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
-    loaded = _contact(motion, friction, elastic, body.side.k1, body.mass, outward, relative, slip)
-    return _Contact(*loaded, largest_overlap(overlap_max, overlap))
+    load = _contact(motion, friction, elastic, body.side.k1, body.mass, outward, relative, slip)
+    return load, largest_overlap(overlap_max, overlap)
 
 
 def _contact(
@@ -200,11 +197,8 @@ def _contact(
     normal: Vector,
     relative: Vector,
     slip: Vector,
-) -> tuple[Vector, Vector, Vector]:
-    """Force on the first body, its moment per unit arm, and slip.
-
-    The normal points to the second body, whose surface moves relative to that of the first.
-    """
+) -> Load:
+    """Load on the first body. The normal points to the second, whose surface moves relative to that of the first."""
     opening = dot(relative, normal)
     touching = elastic > 0
     damping = 2 * motion.interaction.damping

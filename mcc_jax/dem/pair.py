@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -102,16 +103,11 @@ def half_contact(law: MccLaw, particle: Particle, normal: Float[Array, " 3"] | N
 
     with the semi-axes a, b, c = D1/2, D2/2, D3/2, and :math:`\sigma, \delta` of the law (its `a` is :math:`a_s`). R_e
     is the radius of Gaussian curvature where the tangent plane of the ellipsoid has that normal. Along e3 this is the
-    paper's particle exactly; in other directions it is our own generalisation, which no test supports yet. Effects on
-    parameters (size, shape) take the particle as it is tested, along D3; those on the modulus take strain and stress of
-    this side at its own peak. Particles of one pair may differ in all of their laws but the unloading form. `normal` is
-    a unit vector in the frame of the particle's axes, e3 if None.
-
-    Raises:
-        InputError: naming an effect that is no closed formula (`AbstractEffect.closed`), or by which it gains energy.
-
-    References:
-        Bommireddy et al. (2018), eqs. 3 to 5, 13, 16 and 24, for e3.
+    paper's particle exactly (Bommireddy et al. 2018, eqs. 3 to 5, 13, 16 and 24); in other directions it is our own
+    generalisation, which no test supports yet. Effects on parameters (size, shape) take the particle as it is tested,
+    along D3; those on the modulus take strain and stress of this side at its own peak. Particles of one pair may differ
+    in all of their laws but the unloading form. `normal` is a unit vector in the frame of the particle's axes, e3 if
+    None. `InputError` names an effect that is no closed formula (`AbstractEffect.closed`), or by which it gains energy.
     """
     semi = 0.5e-6 * jnp.stack([particle.D1, particle.D2, particle.D3])  # m
     square = semi[2] * semi[2] if normal is None else jnp.sum((semi * normal) ** 2)
@@ -324,29 +320,24 @@ def _split(i: Contact, j: Contact, whole: Scalar) -> Scalar:
     split that still moves leaves it with a negative sign, and goes on between new bounds.
     """
     zero = jnp.zeros_like(whole)
-    bracket = _Bracket(-recompute(j.k1 / (i.k1 + j.k1)) * whole, zero, whole)
+    bracket = _Bracket(-recompute(j.k1 / (i.k1 + j.k1)) * whole, zero, whole, jnp.asarray(0, jnp.int32))
     for _ in range(SPLIT_STEPS):
         bracket = _halley_step(i, j, whole, bracket)
-    d = jax.lax.optimization_barrier(bracket.d)
+    bracket = bracket._replace(d=jax.lax.optimization_barrier(bracket.d), low=zero, high=whole)
 
-    def unfinished(carry: tuple[Array, _Bracket]) -> Array:
-        step, bracket = carry
-        return (bracket.d < 0) & (step < SPLIT_STEPS_AT_MOST)
+    def unfinished(bracket: _Bracket) -> Flag:
+        return (bracket.d < 0) & (bracket.steps < SPLIT_STEPS_AT_MOST)
 
-    def further(carry: tuple[Array, _Bracket]) -> tuple[Array, _Bracket]:
-        step, bracket = carry
-        return step + 1, _halley_step(i, j, whole, bracket)
-
-    start = jnp.asarray(SPLIT_STEPS, jnp.int32), _Bracket(d, zero, whole)
-    return jnp.abs(jax.lax.while_loop(unfinished, further, start)[1].d)
+    return jnp.abs(jax.lax.while_loop(unfinished, functools.partial(_halley_step, i, j, whole), bracket).d)
 
 
 class _Bracket(NamedTuple):
-    """Compression of one side, negative while it moves by more than rounding, and what its size lies between."""
+    """Compression of one side, negative while it moves by more than rounding, what its size lies between, and steps."""
 
     d: Scalar
     low: Scalar
     high: Scalar
+    steps: Int[Array, ""]
 
 
 def _halley_step(i: Contact, j: Contact, whole: Scalar, bracket: _Bracket) -> _Bracket:
@@ -365,4 +356,4 @@ def _halley_step(i: Contact, j: Contact, whole: Scalar, bracket: _Bracket) -> _B
     new = jnp.where(meets, d, new)
     # The method cubes the error: after a step of 1e-5 of the smaller side only rounding is left.
     least = 1e-5 * jnp.minimum(new, whole - new) + 2 * jnp.finfo(d.dtype).eps * whole
-    return _Bracket(jnp.where(jnp.abs(new - d) > least, -new, new), low, high)
+    return _Bracket(jnp.where(jnp.abs(new - d) > least, -new, new), low, high, bracket.steps + 1)
