@@ -93,18 +93,21 @@ def close_pairs(position: Any, radius: Any, skin: float) -> Int[np.ndarray, "pai
     if position.shape != (*radius.shape, 3):
         shapes = f"{position.shape} and {radius.shape}"
         raise InputError(f"position and radius have the shapes {shapes} where (N, 3) and (N,) are expected")
-    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
-    if lost.size:
-        raise InputError(
-            f"the position of particle {lost[0]} is not finite",
-            remedy="A smaller time step, or look at how the packing was made.",
-        )
+    check_finite(position)
     if len(position) < 2:
         return np.zeros((0, 2), np.int64)
     cutoff = 2 * float(radius.max()) + skin
     pairs = _pairs_within(position, cutoff)
     gap = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1) - radius[pairs].sum(axis=1)
     return pairs[gap < skin]
+
+
+def check_finite(position: np.ndarray, when: str = "") -> None:
+    """Refuse positions that are not finite, naming the first particle."""
+    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if lost.size:
+        problem = f"the position of particle {lost[0]} is not finite{when}"
+        raise InputError(problem, remedy="A smaller time step, or look at how the packing was made.")
 
 
 def _pairs_within(position: np.ndarray, cutoff: float) -> np.ndarray:
@@ -124,9 +127,8 @@ def _pairs_within(position: np.ndarray, cutoff: float) -> np.ndarray:
 def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type = np.float64) -> Edges:
     """Edges of virgin contacts from pairs of indices, shape (pairs, 2), in any order; repetitions are dropped.
 
-    Raises:
-        InputError: if the pairs do not fit into a list of the length `capacity`, an index is not of a particle, a
-            particle is paired with itself, or without double precision.
+    `InputError` if the pairs do not fit into a list of the length `capacity`, an index is not of a particle, a particle
+    is paired with itself, or without double precision.
     """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -154,12 +154,8 @@ def compact(
     halved; one that still does not is taken as far as it got and its row is marked, as are rows of springs not as weak
     as asked for (`spring`).
 
-    Args:
-        packing: the spheres.
-        state: where to start (`relaxed`, `start`, or the end of another compaction or motion) in a `die`.
-        heights: of the top punch over the bottom one [m].
-        solver: tolerances.
-        tape: a list to which the load steps are appended, for `replay_compaction`.
+    The walls of the state (`relaxed`, `start`, or the end of another compaction or motion) are a `die`; `heights` are
+    those of the top punch over the bottom one [m]. Load steps are appended to `tape`, for `replay_compaction`.
 
     Returns:
         The state at the end, at rest, and the rows.
@@ -191,13 +187,10 @@ def compact(
 
 def _reach(packing: Packing, state: State, height: float, solver: Solver, halvings: int) -> list[_Attempt]:
     """Load steps to a height, as few as converge."""
-    attempt = _attempt(packing, state, height, solver)
-    if attempt.complete or halvings == 0:
+    before, attempt = _height(state.walls), _attempt(packing, state, height, solver)
+    if attempt.complete or halvings == 0 or height == before:
         return [attempt]
-    middle = 0.5 * (_height(state.walls) + height)
-    if middle in (height, _height(state.walls)):
-        return [attempt]
-    first = _reach(packing, state, middle, solver, halvings - 1)
+    first = _reach(packing, state, 0.5 * (before + height), solver, halvings - 1)
     return first + _reach(packing, first[-1].state, height, solver, halvings - 1)
 
 
@@ -210,8 +203,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     walls = lowered(state.walls, jnp.asarray(height, state.position.dtype))
     guess = state.position.at[:, 2].multiply(min(height / before, 1.0))
     k = float(jnp.mean(packing.sides.k1))
-    evaluations, complete = 0, False
-    best: tuple[Problem, Equilibrium] | None = None
+    evaluations, solved = 0, list[tuple[Problem, Equilibrium]]()
     for spring in solver.springs:
         problem = Problem(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(spring * k))
         found = _find_equilibrium(problem, guess, jnp.asarray(solver.rtol), solver.max_steps)
@@ -224,12 +216,14 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
                 problem = replace(problem, edges=fresh.edges)
                 found = _find_equilibrium(problem, found.position, jnp.asarray(solver.rtol), solver.max_steps)
                 evaluations += int(found.steps)
-        if not bool(found.converged):
-            best = best or (problem, found)
+        solved.append((problem, found))
+        if not found.converged:
             break
-        guess, complete, best = found.position, spring == solver.springs[-1], (problem, found)
-    assert best is not None  # there is at least one spring
-    problem, found = best
+        guess = found.position
+    problem, found = solved[-1]
+    complete = bool(found.converged)
+    if not complete and len(solved) > 1:  # the weakest springs with which it did converge
+        problem, found = solved[-2]
     edges, wall_history = _remembered(problem, found.position)
     end = replace(state, position=found.position, edges=edges, wall_history=wall_history, walls=walls)
     moved = np.asarray(found.position - state.position)
@@ -283,18 +277,17 @@ def _moved(state: State) -> float:
 
 def lowered(walls: Walls, height: Scalar) -> Walls:
     """The walls with the top punch at a height over the bottom one."""
-    bottom, top, barrel = cast(tuple[Plane, Plane, Cylinder], walls)
+    bottom, top, barrel = die_walls(walls)
     return bottom, replace(top, point=bottom.point + height * bottom.normal), barrel
 
 
 def die_walls(walls: Walls) -> tuple[Plane, Plane, Cylinder]:
     """Bottom punch, top punch and barrel; `InputError` if that is not what the walls are."""
-    kinds = tuple(type(wall) for wall in walls)
-    if kinds == (Plane, Plane, Cylinder):
-        bottom, top, barrel = cast(tuple[Plane, Plane, Cylinder], walls)
-        up = jnp.asarray([0.0, 0.0, 1.0], bottom.normal.dtype)
-        if bool(jnp.all((bottom.normal == up) & (top.normal == -up))):
-            return bottom, top, barrel
+    match walls:
+        case (Plane() as bottom, Plane() as top, Cylinder() as barrel):
+            upwards = bottom.normal[2], top.normal[2]
+            if arguments.is_traced(upwards) or upwards == (1, -1):
+                return bottom, top, barrel
     raise InputError("walls that are not bottom punch, top punch and barrel", remedy="Make them with `die`.")
 
 

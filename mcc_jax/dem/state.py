@@ -21,7 +21,7 @@ from .._store import write_file
 from .._types import Scalar
 from ..geometry import Particle
 from ..law import MccLaw
-from .neighbours import Edges, carry_history, close_pairs, list_edges, pair_geometry
+from .neighbours import Edges, carry_history, check_finite, close_pairs, list_edges, pair_geometry
 from .pair import HalfContact, half_contact, pair_split, passive, sides_of
 from .walls import Walls
 
@@ -139,11 +139,8 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
     """A state at rest, of centres [m]: virgin contacts, a fresh list of edges.
 
     Pairs are listed up to an extra distance `skin` [m], for example a fifth of a radius; the list has the length
-    `capacity`, or a tenth more than there are pairs.
-
-    Raises:
-        InputError: if a position is not finite, a particle is outside the walls, a half contact resists nothing, or the
-            pairs do not fit the capacity.
+    `capacity`, or a tenth more than there are pairs. `InputError` if they do not fit, a position is not finite, a
+    particle is outside the walls, or a half contact resists nothing.
     """
     check_packing(packing)
     position = arguments.values(position, "position", shape="centres [m], shape (N, 3)")
@@ -211,27 +208,20 @@ def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
 
 def check_state(state: State) -> None:
     """Refuse a state in which a position is not finite or a centre is behind a wall, naming particle and wall."""
-    lost, behind = (np.asarray(x) for x in _escaped(state))
-    at = f"at {float(state.time):.6g} s"
-    if lost.any():
-        raise InputError(
-            f"the position of particle {np.flatnonzero(lost)[0]} is not finite {at}",
-            remedy="A smaller time step, or look at how the packing was made.",
-        )
-    if behind.any():
-        w, particle = np.argwhere(behind)[0]
-        raise InputError(
-            f"particle {particle} is outside wall {w} ({type(state.walls[w]).__name__}) {at}",
-            remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
-        )
+    at = f" at {float(state.time):.6g} s"
+    check_finite(np.asarray(state.position), at)
+    for w, behind in enumerate(map(np.asarray, _behind(state))):
+        if behind.any():
+            raise InputError(
+                f"particle {np.flatnonzero(behind)[0]} is outside wall {w} ({type(state.walls[w]).__name__}){at}",
+                remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
+            )
 
 
 @jax.jit
-def _escaped(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls particles"]]:
-    """Which particles are nowhere, and which are behind which wall."""
-    behind = [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
-    lost = ~jnp.all(jnp.isfinite(state.position), axis=1)
-    return lost, jnp.stack(behind) if behind else jnp.zeros((0, len(lost)), bool)
+def _behind(state: State) -> list[Bool[Array, " particles"]]:
+    """Which particles are behind each wall."""
+    return [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
 
 
 # ---- a state on disk -------------------------------------------------------------------------------------------------
@@ -239,16 +229,12 @@ def _escaped(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "wall
 
 def save_state(path: str | Path, packing: Packing, state: State) -> None:
     """Write packing and state into one file, replacing an older one only when it is complete."""
-    path = arguments.file_path(path, "path")
-    if not path.parent.is_dir():
-        raise InputError("no such folder", file=path.parent, remedy="Make it first.")
-    write_file(path, encode((packing, state)))
+    write_file(Path(path), encode((packing, state)))
 
 
 def load_state(path: str | Path) -> tuple[Packing, State]:
     """What `save_state` wrote; `InputError` if the file is missing, damaged, or of something else."""
-    path = arguments.file_path(path, "path")
-    match read_archive(path):
+    match read_archive(Path(path)):
         case (Packing() as packing, State() as state):
             return packing, state
     raise InputError("is not a saved state", file=path, remedy="Name one that `save_state` wrote.")

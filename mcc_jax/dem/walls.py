@@ -102,9 +102,7 @@ Walls: TypeAlias = tuple[Wall, ...]
 
 def die(radius: float, height: float) -> Walls:
     """A closed die at rest: bottom punch at z = 0, top punch and rim of the cylinder at the height [m]."""
-    radius = arguments.number(radius, "the radius of a die [m]", above=0)
     height = arguments.number(height, "the height of a die [m]", above=0)
-
     rest, up = jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0])
     barrel = Cylinder(radius, height, 0.05, rest)
     return Plane(rest, up, rest), Plane(height * up, -up, rest), barrel
