@@ -109,7 +109,7 @@ def _noise(filters: Whitening, key: Array, count: int) -> Array:
     return jax.lax.map(one, jax.random.split(key, count))
 
 
-def laws_with(model: Model, C: np.ndarray, a: np.ndarray, modulus: np.ndarray, theta: np.ndarray) -> MccLaw:
+def laws_with(model: Model, C: Any, a: Any, modulus: Any, theta: Any) -> MccLaw:
     """Laws with these numbers, every array field with a leading axis."""
 
     def one(C: Any, a: Any, E: Any, theta: Any) -> MccLaw:

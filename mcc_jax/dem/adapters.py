@@ -20,10 +20,7 @@ def edges_from_jaxmd(neighbours: Any, capacity: int | None = None) -> Edges:
 
     The list has the format OrderedSparse or Sparse (``pip install mcc-jax[jaxmd]``), the edges its length if no
     `capacity` is given. jax-md makes its lists for one cut-off: with spheres of several sizes take the largest sum of
-    two radii.
-
-    Raises:
-        InputError: if the list is dense, or if it overflowed and so pairs are missing.
+    two radii. `InputError` if the list is dense, or overflowed and so lacks pairs.
     """
     index, count = np.asarray(neighbours.idx), len(neighbours.reference_position)
     if "Sparse" not in str(neighbours.format):

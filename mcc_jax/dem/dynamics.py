@@ -159,12 +159,9 @@ def advance(
     """Move on for a time, with a new list of edges whenever a particle has moved by half the skin.
 
     Args:
-        packing: the spheres.
-        motion: how they move.
-        state: where to start.
+        packing, motion, state: the spheres, how they move, and where they start.
         velocity: of each wall [m/s].
-        rows: how often something is measured.
-        steps: steps from one row to the next.
+        rows, steps: how often something is measured, and steps from one row to the next.
         skin: extra distance up to which pairs are listed [m]: as far as a particle moves in a few tens of steps.
         tape: a list to which the lists of edges are appended, for `replay`.
         devices: over which the contacts are divided, for example `jax.devices()`, those of all processes after
@@ -203,11 +200,7 @@ def advance(
 
 
 def replay(
-    packing: Packing,
-    motion: Motion,
-    state: State,
-    tape: Sequence[Segment],
-    devices: Devices | None = None,
+    packing: Packing, motion: Motion, state: State, tape: Sequence[Segment], devices: Devices | None = None
 ) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
@@ -215,10 +208,8 @@ def replay(
     devices are as there. A gradient through thousands of steps is exact for that trajectory, and of little use for
     compaction, because rearrangements are chaotic (see `compact`).
     """
-    if not tape:
-        return state
-    longest = max(int(segment.steps) for segment in tape)
     segments = stacked_lists(tape)
+    longest = max(int(segment.steps) for segment in tape)
 
     def one(state: State, segment: Segment) -> tuple[State, None]:
         state = replace(state, edges=with_list(state.edges, segment.key, segment.i, segment.j))
@@ -280,7 +271,6 @@ def sharded[Moving: eqx.Module](
     if devices is None:
         return loop(contact_forces, packing, motion, state, *further)
     mesh = Mesh(np.asarray(devices), (AXIS,))
-    lengths = [x.shape[0] for x in _remembered(state)]
     whole, share = PartitionSpec(), PartitionSpec(AXIS)
     padded = _padded(state, len(devices))
     specs = eqx.tree_at(_sharded_leaves, jax.tree.map(lambda _: whole, padded), (share,) * len(_sharded_leaves(padded)))
@@ -294,19 +284,15 @@ def sharded[Moving: eqx.Module](
         one_share, mesh=mesh, in_specs=(whole, whole, specs, *(whole for _ in further)), out_specs=(specs, whole)
     )(packing, motion, padded, *further)
     everywhere = NamedSharding(mesh, whole)
-    remembered = zip(_remembered(moved), lengths, strict=True)
-    kept = [jax.lax.with_sharding_constraint(x[:n], everywhere) for x, n in remembered]
+    remembered = zip(_sharded_leaves(moved)[3:], _sharded_leaves(state)[3:], strict=True)
+    kept = [jax.lax.with_sharding_constraint(x[: len(before)], everywhere) for x, before in remembered]
     return eqx.tree_at(_sharded_leaves, moved, (*_sharded_leaves(state)[:3], *kept)), rest
 
 
 def _sharded_leaves(state: Any) -> tuple[jax.Array, ...]:
-    """What is dealt out, one row an edge or a particle."""
-    return (state.edges.key, state.edges.i, state.edges.j, *_remembered(state))
-
-
-def _remembered(state: Any) -> tuple[jax.Array, ...]:
+    """What is dealt out, one row an edge or a particle: three arrays that list the edges, then what they remember."""
     edges, history = state.edges, state.wall_history
-    return edges.overlap_max, edges.slip, history.overlap_max, history.slip
+    return edges.key, edges.i, edges.j, edges.overlap_max, edges.slip, history.overlap_max, history.slip
 
 
 def _padded(state: Any, parts: int) -> Any:

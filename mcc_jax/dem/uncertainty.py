@@ -19,12 +19,12 @@ from .._errors import InputError
 from .._format import described
 from ..calibrate import Posterior
 from ..calibrate.population import Scatter, flattened, particles_at
-from ..law import MccLaw, Plastic
+from ..calibrate.predict import laws_with
+from ..law import MccLaw
 from .neighbours import stacked_lists
 from .quasistatic import TOP, Compaction, LoadStep, Replayed, Solver, compact, replay_stacked
 from .state import MCC_DENSITY, Packing, State, not_monotone, spheres
 
-PROBABILITY = (0.05, 0.5, 0.95)
 REDRAWS = 100  # of a particle's law, until it is monotone
 ROUNDS = 5  # compactions of a fit made again
 TOLERANCE = 1e-7  # of fitted parameters, relative and absolute
@@ -32,7 +32,6 @@ TOLERANCE = 1e-7  # of fitted parameters, relative and absolute
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""
 
-Parameters = Float[Array | np.ndarray, " parameters"]
 PackingOf = Callable[[Float[Array, " parameters"]], Packing]
 
 
@@ -70,7 +69,7 @@ def rescaled(packing: Packing, log_scale: Float[Array, " 4"]) -> Packing:
 
 
 def punch_sensitivity(
-    packing_of: PackingOf, values: Parameters, state: State, tape: Sequence[LoadStep], solver: Solver | None = None
+    packing_of: PackingOf, values: Any, state: State, tape: Sequence[LoadStep], solver: Solver | None = None
 ) -> Sensitivity:
     r"""Derivatives of the punch force with respect to any parameters of the packing, through all load steps.
 
@@ -88,8 +87,8 @@ def punch_sensitivity(
     # Outside the compiled function: that one then is the same for all parametrisations.
     direction = jax.jacfwd(packing_of)(values)
     packing = packing_of(values)
-    jacobian, (force, replayed) = _jacobian(packing, direction, state, stacked_lists(tape), solver or Solver())
-    force, jacobian = np.asarray(force), np.asarray(jacobian)
+    jacobian, replayed = _jacobian(packing, direction, state, stacked_lists(tape), solver or Solver())
+    jacobian, force = np.asarray(jacobian), np.asarray(replayed.on_wall)[:, TOP]
     by_stress, pressed = jacobian[last, len(values) :], force > 0
     share = np.where(pressed, np.asarray(replayed.proximal) / np.where(pressed, force, 1.0), np.inf)
     starts = np.concatenate([[0], np.flatnonzero(last)[:-1] + 1])  # of the rows, among the load steps
@@ -107,14 +106,14 @@ def punch_sensitivity(
 @eqx.filter_jit
 def _jacobian(
     packing: Packing, direction: Packing, state: State, steps: LoadStep, solver: Solver
-) -> tuple[Array, tuple[Array, Replayed]]:
+) -> tuple[Array, Replayed]:
     count = direction.radius.shape[-1]
 
-    def force(parameters: Array) -> tuple[Array, tuple[Array, Replayed]]:
+    def force(parameters: Array) -> tuple[Array, Replayed]:
         along = jax.tree.map(lambda x, dx: x + dx @ parameters[:count], packing, direction)
         springs = steps._replace(spring=steps.spring * jnp.exp(parameters[-1]))
         replayed = replay_stacked(rescaled(along, parameters[count : count + 4]), state, springs, solver)
-        return replayed.on_wall[:, TOP], (replayed.on_wall[:, TOP], replayed)
+        return replayed.on_wall[:, TOP], replayed
 
     return jax.jacfwd(force, has_aux=True)(jnp.zeros(count + len(STRESSES)))
 
@@ -160,34 +159,25 @@ def population_packing(
 
     The z of every particle are drawn once and kept, so that a draw of the population moves all particles together: the
     band is about the population, not about which particles one happened to take. Particles not monotone at the
-    posterior mean are redrawn. Effects of the model act in the contacts, but for those of the instrument. Diameters are
-    in um, the density of a particle in kg/m^3.
-
-    Raises:
-        InputError: if the population hardly has a monotone law; for effects that contacts cannot have, by name.
+    posterior mean are redrawn. Effects of the model act in the contacts, but for those of the instrument; one that
+    contacts cannot have is refused by name. Diameters are in um, the density of a particle in kg/m^3.
     """
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")
     model = calibration.model
-    forms, varying = model.forms, model.scatter.varying
     population = eqx.tree_at(lambda p: p.log_noise, flattened(calibration.population), None)
     draws = np.asarray(jax.vmap(lambda one: ravel_pytree(one)[0])(population))
     _, unravelled = ravel_pytree(jax.tree.map(lambda x: x[0], population))
     names = ("a", "ln Ebar", "mu1", "mu3", "mu5", "tau1", "tau3", "tau5", "scatter of ln Ebar", "scatter of a")
-    names += (*forms.names, *(f"scatter of {name}" for name in model.varying_places))
+    names += (*model.forms.names, *(f"scatter of {name}" for name in model.varying_places))
     size = jnp.asarray(diameter, float)
-    own = Scatter(modulus=True, shape=True, power=model.shape_power, varying=varying)
+    own = Scatter(modulus=True, shape=True, power=model.shape_power, varying=model.scatter.varying)
 
     def laws(values: Array, z: Array) -> MccLaw:
         shared = unravelled(values)
         particles = particles_at(shared, jnp.zeros(len(z)), own, z)
-
-        def one(latent: Array, theta: Array) -> MccLaw:
-            C, modulus = jnp.exp(latent[:3]), jnp.exp(latent[3])
-            forms_of = model.unloading, model.strain_scaling, forms.build(theta)
-            return MccLaw(Plastic(C[0], C[1], C[2]), shared.a, modulus, *forms_of).of_particle()
-
-        return eqx.filter_vmap(one)(particles.latent, particles.theta)
+        C, modulus = jnp.exp(particles.latent[:, :3]), jnp.exp(particles.latent[:, 3])
+        return laws_with(model, C, jnp.full(len(z), shared.a), modulus, particles.theta).of_particle()
 
     rng = np.random.default_rng(arguments.seed(seed))
     z = rng.standard_normal((len(size), own.size))
@@ -216,7 +206,7 @@ def first_order_band(
     state: State,
     heights: Float[np.ndarray, " rows"],
     *,
-    probability: Sequence[float] = PROBABILITY,
+    probability: Sequence[float] = (0.05, 0.5, 0.95),
     solver: Solver | None = None,
 ) -> Band:
     r"""Band from one compaction at the mean of the draws and its sensitivities (delta method).
@@ -267,13 +257,7 @@ class CompactionFit(NamedTuple):
 
 
 def fit_compaction(
-    packing_of: PackingOf,
-    start: Any,
-    state: State,
-    heights: Any,
-    force: Any,
-    *,
-    solver: Solver | None = None,
+    packing_of: PackingOf, start: Any, state: State, heights: Any, force: Any, *, solver: Solver | None = None
 ) -> CompactionFit:
     r"""Parameters whose compaction curve comes closest to a measured one, by Levenberg-Marquardt.
 
@@ -283,10 +267,7 @@ def fit_compaction(
     start (`replay_compaction`); rounds go on until the parameters stay, because contacts may snap elsewhere.
     `packing_of` is the packing as a function of parameters, `start` a first guess of them: take logarithms of positive
     ones; the modulus needs rows of unloading. State, heights and solver are as for `compact`, `force` is that on the
-    top punch at the heights [N].
-
-    Raises:
-        InputError: if heights and forces are not equally many, or fewer than the parameters.
+    top punch at the heights [N], of which there must be no fewer than parameters.
     """
     solver = solver or Solver()
     values, heights = arguments.path(start, "start"), arguments.path(heights, "heights")
