@@ -52,11 +52,7 @@ class Artefact:
 
 
 def jax_artefact(
-    law: MccLaw,
-    particle: Particle,
-    which: Which = "step",
-    *,
-    dtype: Literal["float64", "float32"] = "float64",
+    law: MccLaw, particle: Particle, which: Which = "step", *, dtype: Literal["float64", "float32"] = "float64"
 ) -> Artefact:
     """A function of many contacts at once, serialised by `jax.export` with its reverse-mode derivative.
 

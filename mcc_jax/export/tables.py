@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from jaxtyping import Array
 
 from .. import arguments
@@ -25,13 +26,6 @@ from ..law import TESTED_STRAIN, MccLaw, stress_ratio
 from ..law.response import folded
 from .origin import check
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-    Table = pd.DataFrame
-else:
-    Table = object
-
 Columns = dict[str, np.ndarray]
 TOLERANCE = 1e-5  # largest error of linear interpolation, as a share of each column's largest value
 MIN_ROWS, MAX_ROWS = 64, 65536
@@ -39,7 +33,10 @@ BETWEEN = 8  # points at which an interval is checked
 CORNERS = 4096  # intervals in which a corner is looked for
 
 Units = Literal["um_mN", "SI"]
-SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
+UNITS = {
+    "um_mN": {"displacement": ("um", 1e6), "force": ("mN", 1e3), "tangent": ("mN_per_um", 1e-3)},
+    "SI": {"displacement": ("m", 1.0), "force": ("N", 1.0), "tangent": ("N_per_m", 1.0)},
+}
 RANDOM_PATHS, STEPS = 8, 40
 SMALL = np.array([1e-6, 1e-4, 3e-3, 1e-2, 2e-2, 5e-2])
 """Peaks of the last path over the largest displacement: there the recovered strain leaves its limit for its formula."""
@@ -61,8 +58,8 @@ class CurveTables:
         error: largest error of linear interpolation, as a share of each column's largest value.
     """
 
-    loading: Table
-    unloading: Table
+    loading: pd.DataFrame
+    unloading: pd.DataFrame
     error: float
 
     __repr__ = described()
@@ -72,13 +69,8 @@ def curve_tables(law: MccLaw, particle: Particle) -> CurveTables:
     """Tables of the master curves of a law, right to 1e-5, up to the largest scaled strain of the paper's tests.
 
     With effects they hold for `particle` alone; without effects for all, whose size and shape come in through the
-    scaled strain.
-
-    Raises:
-        InputError: if 65536 points do not suffice, or naming an effect that is no closed formula.
+    scaled strain. `InputError` if 65536 points do not suffice, or naming an effect that is no closed formula.
     """
-    import pandas as pd
-
     check(law, particle)
     formulas, _ = folded(law, law.effects, particle, "the tables")
     side = half_contact(law, particle) if law.effects else None
@@ -151,16 +143,13 @@ def _refined(columns: Callable[[np.ndarray], Columns], corners: list[float]) -> 
     raise InputError(problem, remedy="Export this law in another format")
 
 
-def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> Table:
+def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> pd.DataFrame:
     """Paths of one particle between two platens with the law's force and tangent.
 
     The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
     every place where branches meet; the last unloads from small peaks; the others are random, by the seed. Every path
-    starts from a virgin particle.
-
-    Returns:
-        A pandas table of path, displacement, largest displacement so far, force and tangent; of a law with effects that
-        are no closed formula path, time, displacement and force.
+    starts from a virgin particle. The columns are path, displacement, largest displacement so far, force and tangent;
+    of a law with effects that are no closed formula path, time, displacement and force.
     """
     check(law, particle)
     seed = arguments.seed(seed)
@@ -173,7 +162,7 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units
     return _in_units({name: half.get(name, 1) * values for name, values in columns.items()}, units)
 
 
-def golden_pair_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> Table:
+def golden_pair_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Units = "um_mN") -> pd.DataFrame:
     """Paths of the overlap of two half contacts: with itself, with one of 0.6 times the size, and with a rigid wall.
 
     Both sides carry one force; see `dem.pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
@@ -183,26 +172,23 @@ def golden_pair_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: 
     seed = arguments.seed(seed)
     side = half_contact(law, particle)
     smaller = half_contact(law, jax.tree.map(lambda d: d * OTHER_SIZE, particle))
-    tables = []
-    for name, other in {"equal": side, "smaller": smaller, "wall": None}.items():
-        columns = _of_contact(side, other, seed)
-        tables.append({"partner": np.full(len(columns["path"]), name), **columns})
-    return _in_units({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}, units)
+    partners = {"equal": side, "smaller": smaller, "wall": None}
+    tables = {name: _in_units(_of_contact(side, other, seed), units) for name, other in partners.items()}
+    return pd.concat(tables, names=["partner"]).reset_index(level="partner").reset_index(drop=True)
 
 
 def _of_contact(side: HalfContact, other: HalfContact | None, seed: int) -> Columns:
-    """Paths of the overlap of a pair, or with a rigid wall [um, mN]."""
+    """Paths of the overlap of a pair, or with a rigid wall, in SI units."""
     scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
     paths = _paths(scale, lambda peak: np.asarray(_recovered_overlap(side, other, jnp.asarray(peak))), seed)
     number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
     x, past = np.concatenate(paths), np.concatenate([np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths])
     force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
-    columns = {"path": number, "displacement": 1e6 * x, "displacement_max": 1e6 * past}
-    return columns | {"force": 1e3 * force, "tangent": 1e-3 * tangent}
+    return {"path": number, "displacement": x, "displacement_max": past, "force": force, "tangent": tangent}
 
 
 def _driven(law: MccLaw, particle: Particle, seed: int) -> Columns:
-    """Paths of a law whose effects have a memory, a second from point to point."""
+    """Paths of a law whose effects have a memory, a second from point to point, in SI units."""
     scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
@@ -213,8 +199,8 @@ def _driven(law: MccLaw, particle: Particle, seed: int) -> Columns:
     number, second = np.nonzero(np.arange(length.max()) < length[:, None])
     x = np.array([np.pad(path, (0, length.max() - len(path)), "edge") for path in paths])  # so it compiles once
     along = eqx.filter_vmap(lambda x, time: law.path(particle, law.init(particle), x, time)[1], in_axes=(0, None))
-    force = np.asarray(eqx.filter_jit(along)(jnp.asarray(x), jnp.arange(float(length.max()))))
-    return {"path": number, "time_s": second, "displacement": x[number, second], "force": force[number, second]}
+    force = np.asarray(eqx.filter_jit(along)(jnp.asarray(x), jnp.arange(float(length.max()))))[number, second]
+    return {"path": number, "time_s": second, "displacement": 1e-6 * x[number, second], "force": 1e-3 * force}
 
 
 @eqx.filter_jit
@@ -253,16 +239,14 @@ def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: in
     return [first, *walks, turns.ravel()]
 
 
-def _in_units(columns: Columns, units: Units) -> Table:
-    """A table of columns in um and mN, with the unit wanted in their names."""
-    import pandas as pd
-
-    arguments.choice(units, get_args(Units), "units")
+def _in_units(columns: Columns, units: Units) -> pd.DataFrame:
+    """A table of columns in SI units, in the units wanted, which are then part of the names."""
+    wanted = UNITS[arguments.choice(units, UNITS, "units")]
     named = {}
     for name, values in columns.items():
-        if name.removesuffix("_max") not in SI:  # path, time_s, partner
+        if quantity := wanted.get(name.removesuffix("_max")):
+            unit, factor = quantity
+            named[f"{name}_{unit}"] = factor * values
+        else:  # path, time_s
             named[name] = values
-            continue
-        ours, si, factor = SI[name.removesuffix("_max")]
-        named[f"{name}_{si if units == 'SI' else ours}"] = factor * values if units == "SI" else values
     return pd.DataFrame(named)

@@ -46,11 +46,9 @@ def card(law: MccLaw, particle: Particle, *, origin: Origin = UNKNOWN) -> dict[s
     """The parameter card of a law, ready for `json.dump`.
 
     It has parameters with unit and uncertainty, form of the law, its effects with equation and numbers, validity,
-    formulae in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; of the golden table's
-    particle size and shape factor. Uncertainty and provenance are those of `origin`.
-
-    References:
-        Bommireddy et al. (2018), eqs. 13, 16, 23, 24.
+    formulae in words (Bommireddy et al. 2018, eqs. 13, 16, 23, 24), provenance, warnings and a checksum (SHA-256) over
+    the law and its numbers; of the golden table's particle size and shape factor. Uncertainty and provenance are those
+    of `origin`.
     """
     check(law, particle)
     unloading, scaling = law.unloading, law.strain_scaling
@@ -109,11 +107,8 @@ def write_export(
 ) -> list[str]:
     """Write a law in a format of `FORMATS`, and the golden table that goes with it, into a folder that exists.
 
-    Files of the same names are replaced. The particle is that of the golden table, whose random paths the seed decides;
-    its size is part of `jax` artefacts.
-
-    Returns:
-        Names of the files.
+    Files of the same names are replaced; their names are returned. The particle is that of the golden table, whose
+    random paths the seed decides; its size is part of `jax` artefacts.
 
     Raises:
         InputError: for a format or a folder that does not exist, or a law or particle that is not usable.
