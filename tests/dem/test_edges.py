@@ -1,5 +1,8 @@
 """Lists of contacts: history follows the pair through new lists, other orders, more room, the disk."""
 
+import sys
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,30 +13,16 @@ from packed import PRESSING, SKIN, dense, forces_of, motion, packing
 
 from mcc_jax import InputError
 from mcc_jax._archive import encode
-from mcc_jax.dem import (
-    advance,
-    carry_history,
-    close_pairs,
-    list_edges,
-    load_state,
-    rebuild_list,
-    save_state,
-)
+from mcc_jax.dem import advance, carry_history, close_pairs, list_edges, load_state, rebuild_list, save_state
 
 PARTICLES = 30
 
 
 def with_history(edges, seed=0):
     """The list with numbers to remember in every used place."""
-    rng = np.random.default_rng(seed)
-    return eqx.tree_at(
-        lambda e: (e.overlap_max, e.slip),
-        edges,
-        (
-            jnp.asarray(np.where(edges.active, rng.uniform(1e-7, 1e-5, edges.capacity), 0.0)),
-            jnp.asarray(np.where(np.asarray(edges.active)[:, None], rng.normal(0, 1e-7, (edges.capacity, 3)), 0.0)),
-        ),
-    )
+    rng, used = np.random.default_rng(seed), np.asarray(edges.active)
+    overlap_max, slip = rng.uniform(1e-7, 1e-5, edges.capacity), rng.normal(0, 1e-7, (edges.capacity, 3))
+    return replace(edges, overlap_max=jnp.asarray(overlap_max * used), slip=jnp.asarray(slip * used[:, None]))
 
 
 def remembered(edges):
@@ -85,7 +74,12 @@ def test_keys_hold_many_particles():
     assert (edges.i.tolist(), edges.j.tolist()) == ([0, 999_998], [999_999, 999_999])
 
 
-def test_neighbours_equal_all_pairs():
+@pytest.mark.parametrize("search", ["scipy", "vesin"])
+def test_neighbours_equal_all_pairs(search, monkeypatch):
+    if search == "vesin":
+        pytest.importorskip("vesin")
+    else:
+        monkeypatch.setitem(sys.modules, "vesin", None)
     rng = np.random.default_rng(2)
     position, radius = rng.uniform(0, 1e-3, (200, 3)), rng.uniform(2e-5, 8e-5, 200)
     gap = np.linalg.norm(position[:, None] - position[None], axis=2) - radius[:, None] - radius[None]

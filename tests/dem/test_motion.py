@@ -1,6 +1,7 @@
 """A packing between walls: balance of forces and momentum, friction, new lists, damage reported, derivatives."""
 
 import functools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -42,12 +43,8 @@ STEP = jax.jit(step)
 def stirred(state, seed=0):
     """The state with velocities, so that damping and friction act."""
     rng = np.random.default_rng(seed)
-    shape = state.position.shape
-    return eqx.tree_at(
-        lambda s: (s.velocity, s.spin),
-        state,
-        (jnp.asarray(rng.normal(0, 0.3, shape)), jnp.asarray(rng.normal(0, 3e3, shape))),
-    )
+    velocity, spin = (jnp.asarray(rng.normal(0, size, state.position.shape)) for size in (0.3, 3e3))
+    return replace(state, velocity=velocity, spin=spin)
 
 
 @pytest.mark.extended
@@ -79,8 +76,7 @@ def test_pairs_conserve_momentum_and_angular_momentum():
 def two_spheres(friction, normal_overlap=4e-6):
     pack = spheres(paper_law(), jnp.asarray([100.0, 100.0]))
     position = jnp.asarray([[0.0, 0.0, 0.0], [100e-6 - normal_overlap, 0.0, 0.0]])
-    walls = (Plane([0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]),)
-    state = start(pack, walls, position, SKIN)
+    state = start(pack, (), position, SKIN)
     move = Motion.of(1e-9, Interaction(friction=friction))
     return pack, move, state
 

@@ -26,7 +26,7 @@ from compiling import (
 )
 from helpers import FORMS
 
-from mcc_jax import InputError, MccLaw, Particle, Plastic, paper_law
+from mcc_jax import MccLaw, Plastic, paper_law
 from mcc_jax.export import Origin, c_header
 
 PATHS = {PLATES: 100_000, WALL: 100_000, PAIR: 3000}
@@ -148,11 +148,3 @@ def test_any_name_is_harmless_in_the_comment(tmp_path):
     origin = Origin(particle=name, geometry=name)
     header = c_header(paper_law(), PARTICLE, origin=origin)
     assert not compile_and_run(tmp_path, header, '#include "mcc_law.h"\nint main(void) { return 0; }\n')
-
-
-def test_a_law_out_of_range_is_refused():
-    law = eqx.tree_at(lambda law: law.effective_modulus, paper_law(), jnp.asarray(-1.0))
-    with pytest.raises(InputError, match="must be positive"):
-        c_header(law, PARTICLE)
-    with pytest.raises(InputError, match="shape factor"):
-        c_header(eqx.tree_at(lambda law: law.a, paper_law(), jnp.asarray(-20.0)), Particle(200.0, 190.0, 100.0))
