@@ -84,8 +84,7 @@ def _rounded(x: float, digits: int = 2) -> float:
 
 def closure(search: Search, seed: int) -> Closure:
     """Curve and formula of the smooth discrepancy that was found; `seed` is that of the resamples of particles."""
-    smooth, tests = search.found[UNLISTED].at, search.base.tests
-    assert smooth is not None
+    smooth, tests = search.found[UNLISTED].fitted, search.base.tests
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
     natural = {name: search.natural[name] for name in LETTERS if name in search.natural}
     span = {name: (float(x[mask].min()), float(x[mask].max())) for name, x in natural.items()}

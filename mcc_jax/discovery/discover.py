@@ -227,8 +227,7 @@ def _of_law_alone(found: Discovery, search: Search) -> Discovery:
 
 def _named(found: Discovery, search: Search, winner: Names, known: Library) -> Discovery:
     """The answer with the leading hypothesis: effects or a formula, where, and what it did to the parameters."""
-    fitted = search.found[winner].at
-    assert fitted is not None
+    fitted = search.found[winner].fitted
     left = answer.residuals_of(search.base, search.null, fitted)
     map_ = answer.places(search.base, left.before - left.after)
     found = replace(
@@ -261,8 +260,7 @@ def _named(found: Discovery, search: Search, winner: Names, known: Library) -> D
 def _sampled(found: Discovery, search: Search, winner: Names) -> Discovery:
     """The answer with the posterior of the law with effects, if it may be believed."""
     search.progress("posterior of the law with effects")
-    base, fitted, model = search.base, search.found[winner].at, found.model
-    assert fitted is not None
+    base, fitted, model = search.base, search.found[winner].fitted, found.model
     assert model is not None
     start = fitted.start(base) if fitted.variants == model.effects else None
     given: dict[str, Any] = {"threshold_MPa": base.threshold_MPa, "seed": found.seed, "progress": search.progress}

@@ -47,6 +47,12 @@ class Hypothesis:
     under_other_noise: tuple[Model, np.ndarray] | None = None  # a kind that the tests prefer, hyperparameters there
 
     @property
+    def fitted(self) -> Fitted:
+        """The best formulas at their optimum, where they have been fitted."""
+        assert self.at is not None
+        return self.at
+
+    @property
     def log_evidence(self) -> float:
         """Log marginal likelihood, averaged over its formulas alone and with their misfit."""
         if not self.names or self.names == UNLISTED or (self.own is not None and not np.isfinite(self.with_misfit)):
@@ -69,8 +75,7 @@ class Hypothesis:
 
     def likely_form(self, *, misfit: bool = True) -> tuple[np.ndarray, Design]:
         """Hyperparameters at their mode, and design, in the form and under the noise that the tests prefer."""
-        assert self.at is not None
-        hyper, design = self.at.optimum.hyper, self.at.design
+        hyper, design = self.fitted.optimum.hyper, self.fitted.design
         if misfit and self.is_off and self.misfit is not None:
             hyper, design = self.misfit
         if self.under_other_noise is not None:
@@ -89,8 +94,7 @@ def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, 
     alone. Where the amplitude is another with them, their prior follows it until both agree: otherwise a formula that
     explains nothing by itself would lend its name to what its misfit explains.
     """
-    r = one.at
-    assert r is not None
+    r = one.fitted
     names, units, more = len(r.variants), np.array([v.plausible[0] for v in r.variants]), NO_EXTRA
     curves = r.design.amplitude[..., :names] * (r.theta[:names] / units)  # what every formula adds to the tests [um]
     misfits = [columns_of(v, curves[..., i]) for i, v in enumerate(r.variants)]

@@ -169,8 +169,7 @@ def _separation(search: Search, members: Sequence[str], other: Screen, copies: f
     at: dict[str, int] = {}
     amplitude: dict[str, float] = {}
     for name in members:
-        best = search.found[(name,)].at
-        assert best is not None
+        best = search.found[(name,)].fitted
         variant = best.variants[0]
         rows = [k for k, c in enumerate(each) if c.variant == variant]
         candidate = each[max(rows, key=lambda k: search.screen.information[k])]

@@ -176,8 +176,7 @@ class Search:
 
     def fit_discrepancy(self, leader: Hypothesis, at_least: float) -> None:
         """Log evidence of a name with a smooth discrepancy in addition, where it comes near that of another."""
-        assert leader.at is not None
-        found = self.discrepancy.added_to(self.base, leader.at, at_least)
+        found = self.discrepancy.added_to(self.base, leader.fitted, at_least)
         if found is not None:
             leader.with_discrepancy = found.log_evidence
 
@@ -207,8 +206,7 @@ class Search:
 
     def pairs_with(self, leader: Hypothesis) -> None:
         """The best second names next to a leader, each fitted together with it."""
-        (name,), own, at = leader.names, leader.own, leader.at
-        assert at is not None
+        (name,), own, at = leader.names, leader.own, leader.fitted
         seconds: dict[Names, int] = {}
         for gain, k, c in self.seconds(at, at.variants[0] if own is None else own.variant):
             if gain < 0 or len(seconds) >= SECONDS:
@@ -256,8 +254,7 @@ class Search:
 
     def other_formulas(self, pair: Hypothesis) -> None:
         """A pair by the other formulas of either name, each next to the best of the other, at their own optimum."""
-        assert pair.at is not None
-        fitted, each = self.row_of(pair.at), self.screen.candidates.each
+        fitted, each = self.row_of(pair.fitted), self.screen.candidates.each
         wanted = []
         for k, other in (fitted, fitted[::-1]):
             single = self.fit((k,))
@@ -266,7 +263,7 @@ class Search:
                 if c.mechanism == each[other].mechanism and c.variant.name not in tried and len(tried) < ALL_FORMULAS:
                     tried.add(c.variant.name)
                     wanted.append((k, j))
-        every = [pair.at, *side_by_side(self.fit, wanted)]
+        every = [pair.fitted, *side_by_side(self.fit, wanted)]
         pair.at = max(every, key=lambda r: r.log_evidence)
         pair.alone = float(np.logaddexp.reduce([r.log_evidence for r in every])) - self.log_combinations(pair.names)
         if pair.at is not every[0]:

@@ -76,7 +76,7 @@ def along(
 
     def hook(which: str, k: int, context: Any = (), d_context: Any = ()) -> tuple[Any, Any]:
         given, along = (numbers.effects[k], law, loads, context), (directions.effects[k], d_law, d_loads, d_context)
-        return _staged(_hook, given, along, tests, (forms, which, formulas[k].names), formulas[k].effect)
+        return _staged(_hook, given, along, tests, (forms, which, formulas[k]))
 
     def with_hook(*names: str) -> list[int]:
         return [k for k, formula in enumerate(formulas) if formula.effect.overrides(*names)]
@@ -114,13 +114,11 @@ def along(
 
 
 @compiled
-def _staged(
-    stage: Callable[..., Any], given: Any, directions: Any, tests: tuple[Particle, Any], static: Any, *shared: Any
-) -> tuple[Any, Any]:
+def _staged(stage: Callable[..., Any], given: Any, directions: Any, tests: Any, form: Any) -> tuple[Any, Any]:
     """A stage of every test and its derivatives along directions of what it is given."""
 
     def every(given: Any) -> Any:
-        return jax.vmap(lambda one, test: stage(one, *test, static, *shared))(given, tests)
+        return jax.vmap(lambda one, test: stage(one, *test, form))(given, tests)
 
     value, push = jax.linearize(every, given)
     return value, jax.vmap(push)(directions)
@@ -153,11 +151,11 @@ def _released(given: Any, particle: Particle, record: Record, forms: Forms) -> t
     return reached, context.recoverable, context.displacement
 
 
-def _hook(given: Any, particle: Particle, record: Record, static: Any, effect: AbstractEffect) -> Any:
+def _hook(given: Any, particle: Particle, record: Record, form: tuple[Forms, str, Formula]) -> Any:
     """One hook of an effect with its numbers."""
     numbers, law, loads, moved = given
-    forms, which, names = static
-    effect = replace(effect, **dict(zip(names, numbers, strict=True)))
+    forms, which, formula = form
+    effect = replace(formula.effect, **dict(zip(formula.names, numbers, strict=True)))
     loaded = _loaded(law, loads, particle, record, forms)
     if which == "modify":
         changed = effect.modify(loaded[1], particle, record)

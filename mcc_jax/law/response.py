@@ -109,10 +109,8 @@ def context_along(
     return context
 
 
-def peak_displacement(
-    particle: Particle, record: Record, highest: Path, strain: Path, displacement_max: Scalar
-) -> Path:
-    """Largest displacement so far [um], from the strain of virgin loading at every point's force.
+def peak_displacement(particle: Particle, record: Record, highest: Path, strain: Path, before: Scalar) -> Path:
+    """Largest displacement so far [um], from that before and the strain of virgin loading at every point's force.
 
     Where the record knows its peaks, the branches that follow carry the latest value on virgin loading.
     """
@@ -121,7 +119,7 @@ def peak_displacement(
         new = running_max(on_loading)
     else:
         new = forward_fill(on_loading, (record.force >= record.peak).at[0].set(True))
-    return jnp.where(new > displacement_max, new, displacement_max)
+    return jnp.where(new > before, new, before)
 
 
 def released(context: Context, factors: Sequence[Values]) -> Context:
@@ -154,9 +152,7 @@ def additions(effects: Effects, memory: Memory, context: Context) -> tuple[tuple
     return tuple(memories), tuple(drivers), total
 
 
-def force_at(
-    displacement_under: Callable[[Any, Scalar], Scalar], given: Any, displacement: Scalar, scale: Scalar
-) -> Scalar:
+def force_at(displacement_under: Callable[..., Scalar], given: Any, displacement: Scalar, scale: Scalar) -> Scalar:
     """Force [mN] at which a displacement [um] that grows with force is met; 0 where the platen does not touch.
 
     Bisection in a bracket that grows from a force of the right size; derivatives by the implicit-function rule.
