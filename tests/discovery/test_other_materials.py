@@ -9,8 +9,12 @@ from mcc_jax.discovery import discover
 from mcc_jax.discovery.base import base_fit
 from mcc_jax.discovery.misfit import informative
 from mcc_jax.discovery.settings import DECISIONS
+from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended
+
+RIVALS = ("toe_asperity", "misalignment", "frame_compliance", "finite_hardening_exponent")
+GIVEN = {"library": {name: LIBRARY[name] for name in RIVALS}, "posterior": False, "experiments": False}
 
 
 def hard_spheres(count, toe, seed=0, rows=300):
@@ -55,12 +59,12 @@ def test_time_explains_nothing_of_loading_alone():
 
 
 def test_a_soft_contact_of_hard_spheres_is_named_and_closes_the_gap():
-    found = discover(hard_spheres(12, toe=4e-3), posterior=False, experiments=False)
+    found = discover(hard_spheres(12, toe=4e-3), **GIVEN)
     assert found.candidate_set == (("toe_asperity",),)
     assert found.effects[0].amplitude == pytest.approx(4e-3, rel=0.15)
     assert found.to_json()["gap"]["closed_fraction"] > 0.8
 
 
 def test_hard_spheres_without_a_soft_contact_get_none():
-    found = discover(hard_spheres(8, toe=0.0), posterior=False, experiments=False, confirm=False)
+    found = discover(hard_spheres(8, toe=0.0), **GIVEN, confirm=False)
     assert "toe_asperity" not in {name for names in found.candidate_set or () for name in names}
