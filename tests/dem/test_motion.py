@@ -233,7 +233,7 @@ def test_not_monotone_particles_are_named():
     np.testing.assert_allclose(pack.sides.k1 / laws.plastic.C1, pack.sides.k1[0] / laws.plastic.C1[0])
     assert not not_monotone(packing()).any()
     soft = sides_of(pack.sides, np.flatnonzero(flagged))  # no unique split, but numbers
-    force = jax.vmap(pair_force)(soft, soft, jnp.zeros_like(soft.k1), 2 * soft.tested)
+    force = jax.jit(jax.vmap(pair_force))(soft, soft, jnp.zeros_like(soft.k1), 2 * soft.tested)
     assert np.all(np.isfinite(force))
 
 

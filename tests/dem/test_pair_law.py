@@ -196,7 +196,8 @@ WITH_EFFECTS = [(1, 1, *at) for at in ((0.0, 25.0), (25.0, 24.975), (25.0, 24.75
 @pytest.mark.extended
 @pytest.mark.parametrize(
     ("unloading", "effects", "soft_i", "soft_j", "peak", "overlap"),
-    [*((Unloading.PRINTED, False, *at) for at in PLAIN), *((u, True, *at) for u in Unloading for at in WITH_EFFECTS)],
+    [(Unloading.PRINTED, False, *at) for at in PLAIN]
+    + [(u, True, *at) for u in (Unloading.PRINTED, Unloading.PUNCH) for at in WITH_EFFECTS],
 )
 def test_derivatives_equal_differences(unloading, effects, soft_i, soft_j, peak, overlap):
     """T7: every parameter, on loading and unloading, both modes; sides limited by their peak or by their slope."""
