@@ -72,9 +72,6 @@ def jax_artefact(
         which: `force`, `step` (force, tangent, history) or `step_each` (the same, sizes and C1, C3, C5 as arguments);
             of a law with effects `step`, `step_each` or `step_load` (displacement under a force).
         dtype: precision of arguments, results and constants; float64 needs `jax_enable_x64` here and where it runs.
-
-    Raises:
-        InputError: if float64 is wanted and JAX is in single precision.
     """
     with extra("export"):
         import flatbuffers  # noqa: F401
