@@ -207,6 +207,13 @@ def finite(value: Any, name: str) -> None:
         raise InputError(f"{name} must be a finite number, got {shown(value)}")
 
 
+def double_precision(what: str) -> None:
+    """Raise `RuntimeError` in single precision: `what` needs double precision."""
+    if not jax.config.read("jax_enable_x64"):
+        call = 'jax.config.update("jax_enable_x64", True)'
+        raise RuntimeError(f"{what} needs double precision; call {call} before anything else")
+
+
 def file_path(value: Any, name: str) -> Path:
     """The path of a file or folder."""
     if not isinstance(value, str | os.PathLike) or not str(value):

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -138,11 +137,7 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
     """
     campaign = check_tests(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            "the joint calibration needs double precision; "
-            'call jax.config.update("jax_enable_x64", True) before anything else'
-        )
+    arguments.double_precision("the joint calibration")
     segments = campaign_segments(campaign)
     tests = zip(campaign.curves, campaign.diameters_um, segments, strict=True)
     prepared = dict(enumerate(_prepare(*test, threshold_MPa, most_points) for test in tests))
