@@ -4,12 +4,12 @@ Nothing is registered with pyplot.
 """
 
 from .curves import plot_bands as plot_bands
-from .curves import plot_before_after as plot_before_after
 from .curves import plot_fits as plot_fits
 from .curves import plot_new_particle as plot_new_particle
 from .curves import plot_particles as plot_particles
 from .curves import plot_whitened as plot_whitened
 from .discovery import discovery_figures as discovery_figures
+from .discovery import plot_before_after as plot_before_after
 from .discovery import plot_gap as plot_gap
 from .discovery import plot_ranking as plot_ranking
 from .discovery import plot_shifts as plot_shifts

@@ -1,4 +1,4 @@
-"""Measured tests next to what a calibration or a discovery predicts, and residuals over load and time."""
+"""Measured tests next to what a calibration predicts, and residuals over load."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from .._extras import extra
 from ..calibrate import LeastSquares, PaperCalibration, Posterior, predict_new_particle
 from ..calibrate.curves import FittedCurve
 from ..campaign import PAPER_DIAMETERS_UM, effective_diameter_um
-from ..discovery import Discovery
-from ..effects.record import HOLD, RELOAD, UNLOAD
 from ..geometry import Particle
 from . import style
 
@@ -28,7 +26,6 @@ with extra("plots"):
 LOADING, UNLOADING = style.BLUE, style.VERMILION
 PANELS, COLUMNS = 12, 3  # most particles in a grid of curves, and how many are in a row
 PAGE, PAGE_COLUMNS = 20, 4  # the same on a page of all particles
-GAP_PANELS = 6  # most tests whose residuals are shown over time
 POINTS = 20_000  # no more residuals than these are drawn; the histogram next to them counts them all
 SMALL_POINTS = 8000  # of more points in a panel, dots are small and faint
 NEW_DRAWS, SINGLE_DRAWS = 1000, 6  # curves of a new particle in its band, and of these drawn as lines
@@ -41,20 +38,20 @@ _NOT_USED = Line2D([], [], color=style.PALE, label="not used", **_DOT)
 # ---- measured and calibrated -----------------------------------------------------------------------------------------
 
 
-def _segments(kind: np.ndarray) -> list[np.ndarray]:
+def segments(kind: np.ndarray) -> list[np.ndarray]:
     """Rows of every segment."""
     return np.split(np.arange(len(kind)), np.flatnonzero(np.diff(kind)) + 1)
 
 
-def _draw_curve(ax: Axes, strip: Axes | None, curve: FittedCurve, *, typical: bool) -> None:
-    """Force over displacement, measured and by the law; in the strip, if there is one, over the residual."""
+def _draw_curve(ax: Axes, strip: Axes | None, curve: FittedCurve) -> None:
+    """Force over displacement, measured and by the law; over the residual in the strip, else with the typical curve."""
     measured, force, used = curve.displacement_um, curve.force_mN, curve.used
     ax.plot(measured[~used], force[~used], ".", color=style.PALE, markersize=2.5, markeredgewidth=0)
     drawn = [(ax, np.zeros(len(force)), style.every(len(force), style.CURVE_POINTS), 6.0)]
     if strip is not None:
         strip.axvline(0.0, color=style.GREY, linewidth=0.7)
         drawn.append((strip, curve.own_um, slice(None), 2.5))
-    for segment in _segments(curve.kind):
+    for segment in segments(curve.kind):
         colour = LOADING if curve.kind[segment[0]] == 0 else UNLOADING
         rows = segment[used[segment]]
         along = rows[np.argsort(force[rows], kind="stable")]  # noise of force must not fold the band
@@ -65,7 +62,7 @@ def _draw_curve(ax: Axes, strip: Axes | None, curve: FittedCurve, *, typical: bo
             if len(along) > 1 and np.isfinite(curve.low_um[along]).any():
                 low, high = ((end - origin)[along] for end in (curve.low_um, curve.high_um))
                 panel.fill_betweenx(force[along], low, high, color=colour, alpha=0.3, linewidth=0)
-    if typical:
+    if strip is None:
         ax.plot(curve.typical_um, force, color=style.GREEN, linewidth=1.6)
     # A gap where points do not count; from one segment to the next the line goes on.
     ax.plot(np.where(used, curve.own_um, np.nan), force, color=style.BLACK, linewidth=0.8)
@@ -96,12 +93,10 @@ def _quality(curve: FittedCurve, law_um: np.ndarray) -> str:
     return f", rms {rms:.2g} µm" if np.isfinite(rms) else ""
 
 
-def _draw_particles(
-    calibration: PaperCalibration | LeastSquares | Posterior, chosen: Sequence[int], columns: int, *, joint: bool
-) -> Figure:
+def _draw_particles(calibration: PaperCalibration | LeastSquares | Posterior, chosen: Sequence[int]) -> Figure:
     """A panel for each of these particles of the campaign; of a joint calibration, a strip of residuals next to it."""
-    widths = (1.9, 1.0) if joint else (1.0,)
-    size = (3.2, 2.05) if joint else (2.35, 2.05)
+    joint = not isinstance(calibration, PaperCalibration)
+    columns, size, widths = (COLUMNS, (3.2, 2.05), (1.9, 1.0)) if joint else (PAGE_COLUMNS, (2.35, 2.05), (1.0,))
     labels = (style.DISPLACEMENT, "residual [µm]")[: len(widths)]
     figure, panels = style.grid(len(chosen), columns, size, xlabels=labels, ylabel=style.FORCE, widths=widths)
     names, eta = style.particle_labels(calibration.campaign.particles), style.shape_factors(calibration)
@@ -112,7 +107,7 @@ def _draw_particles(
         else:
             for strip in strips:
                 strip.sharey(ax)
-            _draw_curve(ax, strips[0] if strips else None, curve, typical=not joint)
+            _draw_curve(ax, strips[0] if joint else None, curve)
             detail = _quality(curve, curve.own_um if joint else curve.typical_um)
         colour = style.BLACK if curve.why_not is None else style.GREY
         ax.set_title(f"{names[i]}\n$\\eta_p$ = {eta[i]:.2f}{detail}", fontsize=8, linespacing=1.15, color=colour)
@@ -120,17 +115,17 @@ def _draw_particles(
     return figure
 
 
-def _draw_kept(calibration: Posterior | LeastSquares, what: str, line: str, band: Sequence[Patch] = ()) -> Figure:
-    """At most so many of the particles that took part, spread over the campaign."""
+def _draw_kept(calibration: Posterior | LeastSquares, how: str, band: Sequence[Patch] = ()) -> Figure:
+    """At most so many of the particles that took part, spread over the campaign; `how` is "predicted" or "fitted"."""
     kept = calibration.selection.kept
     chosen = [kept[row] for row in style.spread_over(len(kept), PANELS)]
-    figure = _draw_particles(calibration, chosen, COLUMNS, joint=True)
+    figure = _draw_particles(calibration, chosen)
     handles = [_MEASURED, _RELEASED]
     if any((~calibration.curves[i].used).any() for i in chosen):
         handles.append(_NOT_USED)
-    handles.append(Line2D([], [], color=style.BLACK, linewidth=0.8, label=line))
-    title = what if len(chosen) == len(kept) else f"{what}, {len(chosen)} of {len(kept)} particles"
-    return style.finish_joint(figure, calibration, title, [*handles, *band])
+    handles.append(Line2D([], [], color=style.BLACK, linewidth=0.8, label=how))
+    part = "" if len(chosen) == len(kept) else f", {len(chosen)} of {len(kept)} particles"
+    return style.finish_joint(figure, calibration, f"Measured and {how}{part}", [*handles, *band])
 
 
 @style.styled
@@ -143,7 +138,7 @@ def plot_bands(calibration: Posterior) -> Figure:
     The title counts the points inside.
     """
     band = Patch(color=style.GREY, alpha=0.35, linewidth=0, label="95 %")
-    return _draw_kept(calibration, "Measured and predicted", "predicted", [band])
+    return _draw_kept(calibration, "predicted", [band])
 
 
 @style.styled
@@ -153,7 +148,7 @@ def plot_fits(calibration: LeastSquares) -> Figure:
     Points: measured, pale where they are not compared with the law. Line: the joint fit. The strip next to each panel
     is the residual, measured less fitted [um]; the title gives its root mean square.
     """
-    return _draw_kept(calibration, "Measured and fitted", "fitted")
+    return _draw_kept(calibration, "fitted")
 
 
 def pages_of(calibration: PaperCalibration) -> int:
@@ -169,15 +164,13 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     size and shape, under the measured force. Thin line: the same with the particle's own C1, C3, C5. The title gives
     the shape factor and the root mean square deviation from the mean law. Particles that could not be used are grey,
     with the reason. If the law misses the data altogether, a line below the title says so. Follows the paper's three
-    figures of experimental values and predictions.
-
-    Pages count from 1, with at most 20 particles each.
+    figures of experimental values and predictions. Pages count from 1, with at most 20 particles each.
     """
     count, pages = len(calibration.campaign), pages_of(calibration)
     if page not in range(1, pages + 1):
         raise InputError(f"there is no page {page}; there are {pages}, counted from 1")
     chosen = range((page - 1) * PAGE, min(page * PAGE, count))
-    figure = _draw_particles(calibration, chosen, PAGE_COLUMNS, joint=False)
+    figure = _draw_particles(calibration, chosen)
     handles = [
         _MEASURED,
         _RELEASED,
@@ -249,9 +242,8 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
 
     Bands: central 50 % and 95 % of the posterior's curves at each force, scatter of the particles and uncertainty of
     the population together, without read-out noise. Line: their median. Thin lines: single draws, each the curve of
-    one possible particle. It is loaded to the campaign's median peak stress.
-
-    By default D1, D2, D3 [um] are the medians of the paper's Table 1.
+    one possible particle. It is loaded to the campaign's median peak stress. By default D1, D2, D3 [um] are the medians
+    of the paper's Table 1.
     """
     sizes = np.median(PAPER_DIAMETERS_UM, axis=0) if diameters_um is None else arguments.one_particle(diameters_um)
     campaign, kept = calibration.campaign, list(calibration.selection.kept)
@@ -283,59 +275,3 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
         Line2D([], [], color=style.GREY, linewidth=0.6, label="single draws"),
     ]
     return style.finish_joint(figure, calibration, title, handles)
-
-
-# ---- a discovery -----------------------------------------------------------------------------------------------------
-
-_SHADES = {HOLD: ("hold", "#FBEFD0"), UNLOAD: ("unloading", "#DFECF6"), RELOAD: ("reloading", "#E2F1E8")}
-"""Word and background of kinds of segments; loading stays white."""
-
-
-@style.styled
-def plot_before_after(found: Discovery) -> Figure:
-    """Measured less predicted displacement [um] over time [s] without and with what was added, and the noise floor.
-
-    The six tests that gain most (without a gap: that fit worst). In both cases every particle's own coefficients,
-    modulus and zero are fitted, so that what is shown is what they could not take up. The orange band is the standard
-    deviation of what earlier points do not predict. The numbers are root mean squares of the residuals in units of the
-    noise, independent from point to point: 1 is the floor.
-    """
-    left, base = found.residuals, found.base
-    if left is None or base is None:
-        raise InputError("the base law was not fitted well enough; there is nothing to compare")
-    added = bool(found.effects) or found.closure is not None
-    points = np.maximum(left.used.sum(1), 1)
-    before, after = (np.sum(white**2, 1) for white in (left.white_before, left.white_after))
-    worth = before - after if added else before / points
-    rows = np.sort(np.argsort(-worth, kind="stable")[:GAP_PANELS])
-    labels: style.Look = {"xlabels": ["time [s]"], "ylabel": "measured − predicted [µm]"}
-    figure, panels = style.grid(len(rows), COLUMNS, (2.87, 2.15), **labels)
-    names = style.particle_labels(base.campaign.particles)
-    kinds: set[int] = set()
-    for (ax,), i in zip(panels, rows, strict=True):
-        time, used = left.time_s[i], left.used[i]
-        real = np.flatnonzero(np.concatenate([[True], np.diff(time) > 0]))
-        for segment in _segments(left.kind[i][real]):
-            kind = int(left.kind[i][real[segment[0]]])
-            if kind in _SHADES and len(segment) > 1:
-                ends = time[real[[max(segment[0] - 1, 0), segment[-1]]]]
-                ax.axvspan(*ends, color=_SHADES[kind][1], linewidth=0, zorder=0)
-                kinds.add(kind)
-        floor, one, two = (np.where(used, values[i], np.nan) for values in (left.noise, left.before, left.after))
-        ax.fill_between(time, -floor, floor, color=style.ORANGE, alpha=0.55, linewidth=0, zorder=2)
-        ax.axhline(0.0, color=style.GREY, linewidth=0.7, zorder=1)
-        ax.plot(time, one, color=style.VERMILION, linewidth=0.9, zorder=3)
-        if added:
-            ax.plot(time, two, color=style.BLUE, linewidth=0.9, zorder=4)
-        rms = [f"{np.sqrt(total[i] / points[i]):.2f}" for total in (before, after)]
-        ax.set_title(names[left.particles[i]], fontsize=8)
-        style.headroom(ax, 0.22)
-        style.note(ax, f"{' → '.join(rms) if added else rms[0]} × noise")
-        ax.margins(x=0.01)
-    handles: list[Line2D | Patch] = [Line2D([], [], color=style.VERMILION, label="law alone")]
-    if added:
-        handles.append(Line2D([], [], color=style.BLUE, label="with what was added"))
-    handles.append(Patch(color=style.ORANGE, alpha=0.55, linewidth=0, label="± noise"))
-    handles += [Patch(color=shade, linewidth=0, label=w) for kind, (w, shade) in _SHADES.items() if kind in kinds]
-    title = "What the law leaves, before and after" if added else "What the law leaves: nothing was added"
-    return style.finish(figure, base.campaign, title=title, handles=handles)

@@ -15,12 +15,17 @@ from ..calibrate.estimates import quantities
 from ..calibrate.population import COEFFICIENTS
 from ..discovery import Discovery
 from ..discovery.settings import DETECTABLE
+from ..effects.record import HOLD, RELOAD, UNLOAD
 from . import style
-from .curves import plot_bands, plot_before_after
+from .curves import COLUMNS, plot_bands, segments
 from .posterior import plot_prior_posterior
 
+NOT_FITTED = "the base law was not fitted well enough; there is nothing to draw"
+GAP_PANELS = 6  # most tests whose residuals are shown over time
 ALIKE = 10  # mechanisms in the table of those that look alike, members of the sets aside
 _FLOOR: style.Look = {"color": style.BLACK, "linestyle": "--", "linewidth": 1.0}
+_SHADES = {HOLD: ("hold", "#FBEFD0"), UNLOAD: ("unloading", "#DFECF6"), RELOAD: ("reloading", "#E2F1E8")}
+"""Word and background of kinds of segments; loading stays white."""
 
 
 def discovery_figures(found: Discovery) -> dict[str, Figure]:
@@ -40,7 +45,7 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
 
 def _finished(figure: Figure, found: Discovery, **more: Any) -> Figure:
     if found.base is None:
-        raise InputError("the base law was not fitted; there is nothing to draw")
+        raise InputError(NOT_FITTED)
     return style.finish(figure, found.base.campaign, **more)
 
 
@@ -80,6 +85,56 @@ def plot_where(found: Discovery) -> Figure:
     title = "Where law and tests disagree" + (": nowhere beyond noise" if nothing else "")
     warning = "These are shares of what noise alone leaves: no gap was found." if nothing else ""
     return _finished(figure, found, title=title, warning=warning)
+
+
+@style.styled
+def plot_before_after(found: Discovery) -> Figure:
+    """Measured less predicted displacement [um] over time [s] without and with what was added, and the noise floor.
+
+    The six tests that gain most (without a gap: that fit worst). In both cases every particle's own coefficients,
+    modulus and zero are fitted, so that what is shown is what they could not take up. The orange band is the standard
+    deviation of what earlier points do not predict. The numbers are root mean squares of the residuals in units of the
+    noise, independent from point to point: 1 is the floor.
+    """
+    left, base = found.residuals, found.base
+    if left is None or base is None:
+        raise InputError(NOT_FITTED)
+    added = bool(found.effects) or found.closure is not None
+    points = np.maximum(left.used.sum(1), 1)
+    before, after = (np.sum(white**2, 1) for white in (left.white_before, left.white_after))
+    worth = before - after if added else before / points
+    rows = np.sort(np.argsort(-worth, kind="stable")[:GAP_PANELS])
+    labels: style.Look = {"xlabels": ["time [s]"], "ylabel": "measured − predicted [µm]"}
+    figure, panels = style.grid(len(rows), COLUMNS, (2.87, 2.15), **labels)
+    names = style.particle_labels(base.campaign.particles)
+    kinds: set[int] = set()
+    for (ax,), i in zip(panels, rows, strict=True):
+        time, used = left.time_s[i], left.used[i]
+        real = np.flatnonzero(np.concatenate([[True], np.diff(time) > 0]))
+        for segment in segments(left.kind[i][real]):
+            kind = int(left.kind[i][real[segment[0]]])
+            if kind in _SHADES and len(segment) > 1:
+                ends = time[real[[max(segment[0] - 1, 0), segment[-1]]]]
+                ax.axvspan(*ends, color=_SHADES[kind][1], linewidth=0, zorder=0)
+                kinds.add(kind)
+        floor, one, two = (np.where(used, values[i], np.nan) for values in (left.noise, left.before, left.after))
+        ax.fill_between(time, -floor, floor, color=style.ORANGE, alpha=0.55, linewidth=0, zorder=2)
+        ax.axhline(0.0, color=style.GREY, linewidth=0.7, zorder=1)
+        ax.plot(time, one, color=style.VERMILION, linewidth=0.9, zorder=3)
+        if added:
+            ax.plot(time, two, color=style.BLUE, linewidth=0.9, zorder=4)
+        rms = [f"{np.sqrt(total[i] / points[i]):.2f}" for total in (before, after)]
+        ax.set_title(names[left.particles[i]], fontsize=8)
+        style.headroom(ax, 0.22)
+        style.note(ax, f"{' → '.join(rms) if added else rms[0]} × noise")
+        ax.margins(x=0.01)
+    handles: list[Line2D | Patch] = [Line2D([], [], color=style.VERMILION, label="law alone")]
+    if added:
+        handles.append(Line2D([], [], color=style.BLUE, label="with what was added"))
+    handles.append(Patch(color=style.ORANGE, alpha=0.55, linewidth=0, label="± noise"))
+    handles += [Patch(color=shade, linewidth=0, label=w) for kind, (w, shade) in _SHADES.items() if kind in kinds]
+    title = "What the law leaves, before and after" if added else "What the law leaves: nothing was added"
+    return _finished(figure, found, title=title, handles=handles)
 
 
 @style.styled
@@ -131,9 +186,9 @@ def plot_ranking(found: Discovery) -> Figure:
     ax.text(1.1, 1.0, "probability", ha="right", **header)
     ax.text(1.13, 1.0, "estimate and detection limit", **header)
     handles = [Patch(label=kind, **look) for kind, look in kinds.items() if kind in seen]
-    handles = [*handles, Line2D([], [], label="detection limit", **_FLOOR)]
+    line = Line2D([], [], label="detection limit", **_FLOOR)
     title = "What could be missing: no gap was found" if found.verdict == "NO_GAP" else "What explains the gap"
-    return _finished(figure, found, title=title, handles=handles)
+    return _finished(figure, found, title=title, handles=[*handles, line])
 
 
 @style.styled
@@ -143,7 +198,7 @@ def plot_similarity(found: Discovery) -> Figure:
     Members of the set first (bold). Above 0.9 no analysis of these data distinguishes two mechanisms; other data may.
     """
     if found.likeness is None:
-        raise InputError("the base law was not fitted well enough; there is nothing to compare")
+        raise InputError(NOT_FITTED)
     members = {name for group in found.candidate_set for name in group}
     count = min(max(ALIKE, len(members)), len(found.likeness.names))
     names, both = found.likeness.names[:count], found.likeness.correlation[:count, :count]

@@ -18,22 +18,15 @@ from .curves import pages_of, plot_particles
 
 _DOTTED: style.Look = {"color": style.GREY, "linewidth": 0.8, "dashes": (1, 1.5)}
 _DASHED: style.Look = {"dashes": (3.5, 1.8)}
-_MEAN: style.Look = {
-    "color": style.BLUE,
-    "marker": "o",
-    "linestyle": "",
-    "markeredgecolor": "white",
-    "markeredgewidth": 0.4,
-}
+_MEAN: style.Look = {"color": style.BLUE, "markeredgecolor": "white", "markeredgewidth": 0.4}
 _BAND: style.Look = {"color": style.BLUE, "alpha": 0.25, "linewidth": 0}
 _SMALL: style.Look = {"fontsize": 7, "color": style.GREY}
 
 
 def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     """Every figure of the calibration by the stem of its file's name; more than 20 particles take several pages."""
-    figures = style.by_stem(
-        (plot_curves, plot_collapse, plot_master, plot_law, plot_elastic, plot_residuals), calibration
-    )
+    plots = (plot_curves, plot_collapse, plot_master, plot_law, plot_elastic, plot_residuals)
+    figures = style.by_stem(plots, calibration)
     figures["dimensions"] = plot_dimensions(calibration.campaign)
     for page in range(1, pages_of(calibration) + 1):
         figures["particles" if page == 1 else f"particles_{page}"] = plot_particles(calibration, page)
@@ -44,13 +37,11 @@ def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
 
 
 def adjusted_curve(calibration: PaperCalibration, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Strain [-] and stress [MPa] of a whole kept test after the offset step, with its line up to the threshold."""
+    """Strain [-] and stress [MPa] of a whole kept test after an offset step, with its line up to the threshold."""
     campaign, adjustment = calibration.campaign, calibration.adjustment
     segments = adjustment.segments[index]
     stress, strain = stress_and_strain(campaign.curves[index], campaign.diameters_um[index], segments)
     strain = strain + adjustment.shift[index]
-    if adjustment.threshold_MPa == 0:
-        return strain, stress
     approach = max((part.stop for part in segments if part.kind == "approach"), default=0)
     first = approach + int(np.argmax(stress[approach:] > adjustment.threshold_MPa))
     corner = np.array([[0.0, adjustment.strain], [0.0, adjustment.threshold_MPa]])
@@ -194,7 +185,7 @@ def plot_master(calibration: PaperCalibration) -> Figure:
     low, high = master.mean - master.sd, master.mean + master.sd
     upper.fill_between(master.stress_MPa, low, high, label="mean ± 1 sd", **_BAND)
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
-    upper.plot(master.stress_MPa, master.mean, markevery=step, label="mean", **_MEAN)
+    upper.plot(master.stress_MPa, master.mean, "o", markevery=step, label="mean", **_MEAN)
     upper.set(ylabel=style.SCALED_STRAIN, ylim=(0, None))
     upper.legend(loc="lower right")
     style.note(upper, f"a = {calibration.a:.2f}, {len(eta)} particles")
@@ -218,8 +209,7 @@ def stretches_outside(calibration: PaperCalibration) -> list[tuple[int, int]]:
     """First and last position on the master curve of every stretch of at least three points, above the threshold,
     where the mean law is more than one sample standard deviation of strain off."""
     master = calibration.master
-    with np.errstate(invalid="ignore"):
-        off = np.abs(law_strain(calibration) - master.mean) > master.sd
+    off = np.abs(law_strain(calibration) - master.mean) > master.sd
     outside = off & (master.stress_MPa > calibration.adjustment.threshold_MPa)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], outside, [False]]).astype(int)))
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 3]
@@ -245,7 +235,7 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     low, high = master.mean - master.sd, master.mean + master.sd
     ax.fill_betweenx(master.stress_MPa, low, high, label="sample mean ± 1 sd of strain", **_BAND)
     step = style.every(len(master.mean), style.MEAN_MARKERS).step
-    ax.plot(master.mean, master.stress_MPa, markevery=step, label="sample mean", **_MEAN)
+    ax.plot(master.mean, master.stress_MPa, "o", markevery=step, label="sample mean", **_MEAN)
     law: style.Look = {"color": style.VERMILION, "linewidth": 1.0}
     ax.plot(x, mean, color=style.VERMILION, linewidth=1.6, label="mean law")
     ax.plot(x, mean + sd, label="± 1 sd of stress", dashes=(4, 2), **law)
@@ -288,7 +278,8 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     modulus = fit.effective_modulus_MPa
     if modulus is None:
         for ax in (left, right):
-            style.empty(ax, fit.reason or "no effective modulus")
+            ax.text(0.5, 0.5, fit.reason, ha="center", va="center", color=style.GREY, wrap=True)
+            ax.set_axis_off()
         return style.finish(figure, calibration.campaign)
     eta = style.shape_factors(calibration)[[b.particle for b in fit.branches]]
     colours = style.sequential(eta)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from arviz_stats.base.array import array_stats
@@ -64,8 +64,7 @@ def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
 
 def _scaled(named: dict[str, Any]) -> dict[str, Any]:
     """Draws in the order and the units of the figures."""
-    factors = {"effective_modulus_MPa": 1e-3}
-    return {name: named[name] * factors.get(name, 1.0) for name in LABELS if name in named}
+    return {name: named[name] * (1e-3 if name.endswith("_MPa") else 1.0) for name in LABELS if name in named}
 
 
 def density(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -127,14 +126,6 @@ def plot_pairs(calibration: Posterior) -> Figure:
     return style.finish_joint(figure, calibration, f"Population, {chains} × {each} draws")
 
 
-def prior_of(calibration: Posterior) -> dict[str, np.ndarray]:
-    """Draws of the population's prior, by the names and in the units of the figures."""
-    found = prior_draws(calibration, PRIOR_DRAWS, 0)
-    for vector in ("mu", "tau"):
-        found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(COEFFICIENTS)}
-    return _scaled(found)
-
-
 @style.styled
 def plot_prior_posterior(calibration: Posterior) -> Figure:
     """Prior and posterior density of every parameter of the population, with the paper's value.
@@ -143,10 +134,11 @@ def plot_prior_posterior(calibration: Posterior) -> Figure:
     enlarged to the posterior, where a level prior is one that says nothing there. Each density is divided by its peak.
     The paper has no value for the noise, the scatter of modulus and `a`, and for other forms of unloading no modulus.
     """
-    posterior, prior = _scaled(calibration.named_population()), prior_of(calibration)
-    paper = _scaled(
-        {row["quantity"]: row["paper"] for row in compare_with_paper(calibration) if row["paper"] is not None}
-    )
+    drawn = prior_draws(calibration, PRIOR_DRAWS, 0)
+    for vector in ("mu", "tau"):
+        drawn |= {f"{vector}_{name}": drawn[vector][..., j] for j, name in enumerate(COEFFICIENTS)}
+    known = {row["quantity"]: row["paper"] for row in compare_with_paper(calibration) if row["paper"] is not None}
+    posterior, prior, paper = map(_scaled, (calibration.named_population(), drawn, known))
     labels: style.Look = {"xlabels": ["", ""], "ylabel": "density / peak [-]"}
     figure, panels = style.grid(len(posterior), 2, (4.8, 1.5), widths=(1.0, 1.0), **labels)
     for (name, values), (whole, near) in zip(posterior.items(), panels, strict=True):
@@ -197,38 +189,20 @@ def prior_near(prior: np.ndarray, end: float) -> np.ndarray:
 # ---- the particles ---------------------------------------------------------------------------------------------------
 
 
-class CoefficientTable(NamedTuple):
-    """C1, C3, C5 of N particles [-] and of the population, without the 50 % interval and with NaN where unknown."""
+def draw_forest(
+    labels: Sequence[str],
+    centre: np.ndarray,
+    wide: np.ndarray,
+    median: np.ndarray,
+    population: np.ndarray,
+    narrow: np.ndarray | None = None,
+) -> tuple[Figure, list[Line2D | Patch]]:
+    """Three panels of C1, C3, C5 [-] of N particles, and the handles of their legend.
 
-    centre: np.ndarray  # best value or median, shape (N, 3)
-    wide: np.ndarray  # ends of the 95 % interval, shape (2, N, 3)
-    narrow: np.ndarray | None  # ends of the 50 % interval
-    median: np.ndarray  # of the population, shape (3,)
-    spread: np.ndarray  # interval of 95 % of the particles, shape (2, 3)
-
-
-def posterior_table(calibration: Posterior) -> CoefficientTable:
-    """Medians and intervals of the posterior; the spread includes what is not known of the population."""
-    q = np.quantile(np.asarray(calibration.C), [0.025, 0.25, 0.5, 0.75, 0.975], axis=(0, 1))
-    mu, tau = (np.asarray(v).reshape(-1, 3) for v in (calibration.population.mu, calibration.population.tau))
-    new = mu[None] + tau[None] * np.random.default_rng(0).standard_normal((10, *mu.shape))
-    spread = np.exp(np.quantile(new.reshape(-1, 3), [0.025, 0.975], axis=0))
-    return CoefficientTable(q[2], q[[0, 4]], q[[1, 3]], np.exp(np.median(mu, axis=0)), spread)
-
-
-def least_squares_table(calibration: LeastSquares) -> CoefficientTable:
-    """Estimates and 95 % intervals of the joint least squares."""
-    found = [[entry[n] for n in COEFFICIENTS] for entry in calibration.to_json()["particles"] if entry["kept"]]
-    centre = np.array([[one["value"] for one in row] for row in found], float)
-    wide = np.array([[one["interval_95"] or [np.nan, np.nan] for one in row] for row in found], float)
-    mu, tau = np.asarray(calibration.solution.value.shared)[2:5], np.asarray(calibration.settings.population.tau)
-    spread = np.exp(mu + 1.96 * np.array([[-1.0], [1.0]]) * tau)
-    return CoefficientTable(centre, np.moveaxis(wide, -1, 0), None, np.exp(mu), spread)
-
-
-def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure, list[Line2D | Patch]]:
-    """Three panels of intervals, and the handles of their legend."""
-    count, single = len(labels), table.narrow is None
+    Of the particles estimates, shape (N, 3), and ends of their 95 % and 50 % intervals, shape (2, N, 3), NaN where
+    unknown; of the population median, shape (3,), and ends of the interval of 95 % of its particles, shape (2, 3).
+    """
+    count, single = len(labels), narrow is None
     labelled = count <= LABELLED
     thick, size = (3.2, 4.0) if labelled else (1.2, 1.5)
     outer = style.BLUE if single else style.SKY
@@ -237,20 +211,20 @@ def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure,
     for j, ax in enumerate(panels):
         chosen, y = np.arange(count), np.arange(float(count))
         if not labelled:
-            chosen = np.argsort(table.centre[:, j], kind="stable")[style.spread_over(count, ROWS)]
+            chosen = np.argsort(centre[:, j], kind="stable")[style.spread_over(count, ROWS)]
             y = np.linspace(0, 1, len(chosen))
-        ax.axvspan(*table.spread[:, j], color=style.ORANGE, alpha=0.22, linewidth=0, zorder=0)
-        ax.axvline(table.median[j], color=style.VERMILION, linewidth=1.1, zorder=1)
-        ax.hlines(y, *table.wide[:, chosen, j], color=outer, linewidth=1.1, zorder=2)
-        if table.narrow is not None:
-            ax.hlines(y, *table.narrow[:, chosen, j], color=style.BLUE, linewidth=thick, zorder=3)
-        ax.plot(table.centre[chosen, j], y, "o", color=style.BLACK, markersize=size, markeredgewidth=0, zorder=4)
+        ax.axvspan(*population[:, j], color=style.ORANGE, alpha=0.22, linewidth=0, zorder=0)
+        ax.axvline(median[j], color=style.VERMILION, linewidth=1.1, zorder=1)
+        ax.hlines(y, *wide[:, chosen, j], color=outer, linewidth=1.1, zorder=2)
+        if narrow is not None:
+            ax.hlines(y, *narrow[:, chosen, j], color=style.BLUE, linewidth=thick, zorder=3)
+        ax.plot(centre[chosen, j], y, "o", color=style.BLACK, markersize=size, markeredgewidth=0, zorder=4)
         ax.set_xlabel(f"{_SYMBOLS[j]} [-]")
         ax.locator_params(axis="x", nbins=5)
         ax.use_sticky_edges = False  # the band's ends are no limits of the axis
         ax.margins(x=0.04)
         # How wide intervals usually are: they may be narrower than their dots.
-        half = (table.wide[1] - table.wide[0])[:, j] / (2 * table.centre[:, j])
+        half = (wide[1] - wide[0])[:, j] / (2 * centre[:, j])
         half = half[np.isfinite(half)]
         typical = f"typical 95 % interval: ± {100 * np.median(half):.2g} %" if len(half) else "no intervals"
         ax.set_title(typical, fontsize=8)
@@ -269,10 +243,10 @@ def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure,
     return figure, handles
 
 
-def _forest(calibration: Posterior | LeastSquares, table: CoefficientTable) -> Figure:
+def _forest(calibration: Posterior | LeastSquares, **numbers: np.ndarray) -> Figure:
     names = style.particle_labels(calibration.campaign.particles)
-    figure, handles = draw_forest(table, [names[i] for i in calibration.selection.kept])
-    title, count = "Coefficients of the particles", len(table.centre)
+    figure, handles = draw_forest([names[i] for i in calibration.selection.kept], **numbers)
+    title, count = "Coefficients of the particles", len(calibration.selection.kept)
     if count > LABELLED:
         shown = f"{ROWS} of {count}" if count > ROWS else f"{count}"
         title += f", {shown} particles, each panel in its own order"
@@ -287,7 +261,12 @@ def plot_forest(calibration: Posterior) -> Figure:
     Up to 40 particles have a row each, in the campaign's order. Of more, at most 200 are shown, in each panel from the
     smallest to the largest, so that the dots also draw the distribution function of the coefficient.
     """
-    return _forest(calibration, posterior_table(calibration))
+    q = np.quantile(np.asarray(calibration.C), [0.025, 0.25, 0.5, 0.75, 0.975], axis=(0, 1))
+    mu, tau = (np.asarray(v).reshape(-1, 3) for v in (calibration.population.mu, calibration.population.tau))
+    new = mu[None] + tau[None] * np.random.default_rng(0).standard_normal((10, *mu.shape))
+    band = np.exp(np.quantile(new.reshape(-1, 3), [0.025, 0.975], axis=0))
+    median = np.exp(np.median(mu, axis=0))
+    return _forest(calibration, centre=q[2], wide=q[[0, 4]], narrow=q[[1, 3]], median=median, population=band)
 
 
 @style.styled
@@ -297,7 +276,12 @@ def plot_estimates(calibration: LeastSquares) -> Figure:
     Line and band are the population's median and the interval of 95 % of its particles. Particles are ordered as in
     `plot_forest`. Without error bars where the data leave the coefficients open.
     """
-    return _forest(calibration, least_squares_table(calibration))
+    found = [[entry[n] for n in COEFFICIENTS] for entry in calibration.to_json()["particles"] if entry["kept"]]
+    centre = np.array([[one["value"] for one in row] for row in found], float)
+    wide = np.array([[one["interval_95"] or [np.nan, np.nan] for one in row] for row in found], float)
+    mu, tau = np.asarray(calibration.solution.value.shared)[2:5], np.asarray(calibration.settings.population.tau)
+    band = np.exp(mu + 1.96 * np.array([[-1.0], [1.0]]) * tau)
+    return _forest(calibration, centre=centre, wide=np.moveaxis(wide, -1, 0), median=np.exp(mu), population=band)
 
 
 def shrinkage(calibration: Posterior) -> tuple[np.ndarray, np.ndarray]:

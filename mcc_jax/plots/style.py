@@ -40,8 +40,7 @@ SHAPE_FACTOR = "shape factor $\\eta_p$ [-]"
 FORCE = "force $F$ [mN]"
 DISPLACEMENT = "displacement $\\gamma$ [µm]"
 
-FONT = "DejaVu Sans"
-"""Comes with matplotlib, so that a figure looks the same everywhere."""
+FONT = "DejaVu Sans"  # comes with matplotlib, so that a figure looks the same everywhere
 SMALL = 7.5
 RC: dict[Any, Any] = {
     "font.family": FONT,
@@ -178,19 +177,10 @@ def finish_joint(
 
 def note(ax: Axes, text: str, *, place: str = "upper left") -> None:
     """A few small words in a corner of a panel."""
-    words: Look = {"fontsize": SMALL, "linespacing": 1.35}
-    box = AnchoredText(text, loc=place, prop=words, pad=0.2, borderpad=0.3)
+    box = AnchoredText(text, loc=place, prop={"fontsize": SMALL, "linespacing": 1.35}, pad=0.2, borderpad=0.3)
     box.patch.set(facecolor="white", edgecolor="none", alpha=0.75)
     box.set_zorder(10)
     ax.add_artist(box)
-
-
-def empty(ax: Axes, text: str) -> None:
-    """Say why a panel shows nothing."""
-    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center", color=GREY, wrap=True)
-    ax.spines[:].set_visible(False)
-    ax.set_xticks([])
-    ax.set_yticks([])
 
 
 def headroom(ax: Axes, share: float) -> None:
@@ -201,8 +191,7 @@ def headroom(ax: Axes, share: float) -> None:
 
 def sequential(values: np.ndarray) -> ScalarMappable:
     """Perceptually uniform colours over the range of the values, short of the brightest, which white would swallow."""
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    low, high = float(values.min()), float(values.max())
     if not high - low > 1e-6 * max(abs(low), abs(high)):
         low, high = low - 0.05, high + 0.05
     return ScalarMappable(Normalize(low, high), ListedColormap(colormaps["viridis"](np.linspace(0, 0.9, 256))))

@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -50,19 +52,7 @@ def campaigns():
     }
 
 
-class Calibrations(dict):
-    """Each campaign is calibrated where it is first asked for: every number of particles is compiled again."""
-
-    def __init__(self, campaigns):
-        super().__init__()
-        self.campaigns = campaigns
-
-    def __missing__(self, name):
-        found = calibrate_paper(self.campaigns[name])
-        self[name] = found
-        return found
-
-
 @pytest.fixture(scope="session")
-def calibrations(campaigns):
-    return Calibrations(campaigns)
+def calibrated(campaigns):
+    """The paper's calibration of a campaign by its name, made where it is first asked for."""
+    return functools.cache(lambda name: calibrate_paper(campaigns[name]))

@@ -49,23 +49,23 @@ def kind(request):
 
 
 @pytest.fixture
-def calibration(calibrations, kind):
-    return calibrations[kind]
+def calibration(calibrated, kind):
+    return calibrated(kind)
 
 
 @pytest.fixture(scope="module")
-def saved(calibrations, kind, tmp_path_factory):
+def saved(calibrated, kind, tmp_path_factory):
     """All figures of a calibration, drawn, and their files."""
     settings = dict(mpl.rcParams)
-    figures = paper_figures(calibrations[kind])
+    figures = paper_figures(calibrated(kind))
     files = save_figures(figures, tmp_path_factory.mktemp(kind), dpi=100)
     assert dict(mpl.rcParams) == settings
     return figures, files
 
 
 @pytest.fixture
-def paper(calibrations):
-    return calibrations["paper"]
+def paper(calibrated):
+    return calibrated("paper")
 
 
 # ---- all figures -----------------------------------------------------------------------------------------------------
@@ -119,8 +119,8 @@ def test_curves_span_the_shape_factors(paper):
 
 
 @pytest.mark.extended
-def test_adjusted_curves_meet_at_the_threshold(calibrations):
-    r = calibrations["dropped"]
+def test_adjusted_curves_meet_at_the_threshold(calibrated):
+    r = calibrated("dropped")
     for i in np.flatnonzero(r.adjustment.kept):
         strain, stress = adjusted_curve(r, int(i))
         assert (strain[0], stress[0]) == (0, 0)
@@ -262,8 +262,8 @@ def test_panels_show_measured_and_predicted(paper):
 
 
 @pytest.mark.extended
-def test_particles_that_were_not_kept_show_the_reason(calibrations):
-    r = calibrations["dropped"]
+def test_particles_that_were_not_kept_show_the_reason(calibrated):
+    r = calibrated("dropped")
     shown = panels(plot_particles(r))
     assert [len(ax.lines) > 3 for ax in shown] == r.adjustment.kept.tolist()
     for ax, curve, reason in zip(shown, r.curves, r.adjustment.why_not, strict=True):
@@ -274,8 +274,8 @@ def test_particles_that_were_not_kept_show_the_reason(calibrations):
 
 
 @pytest.mark.extended
-def test_a_law_that_misses_the_data_is_said_so(calibrations):
-    r = calibrations["two"]
+def test_a_law_that_misses_the_data_is_said_so(calibrated):
+    r = calibrated("two")
     assert not any("misses" in t for t in texts(plot_particles(r)))
     off = (dict.fromkeys(("predicted_um", "own_um"), p.measured_um + 50.0) for p in r.particles)
     bad = tuple(dataclasses.replace(p, **away) for p, away in zip(r.particles, off, strict=True))

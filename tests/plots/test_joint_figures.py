@@ -1,6 +1,7 @@
 """The figures of the joint calibrations: they draw for campaigns of every size, and show what the calibration holds."""
 
 import dataclasses
+import functools
 import re
 
 import matplotlib as mpl
@@ -23,7 +24,7 @@ from mcc_jax.plots import (
     posterior_figures,
     save_figures,
 )
-from mcc_jax.plots.posterior import CoefficientTable, density, draw_forest, prior_near, shrinkage
+from mcc_jax.plots.posterior import density, draw_forest, prior_near, shrinkage
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
@@ -33,20 +34,18 @@ STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_partic
 pytestmark = pytest.mark.extended
 
 
-class Calibrations(dict):
-    """That of one particle compiles anew, so it is made only where it is asked for."""
-
-    def __missing__(self, name):
-        assert name == "one"
-        one = paper_campaign(0).select(np.arange(20) == 3)
-        self[name] = sample(one, draws=200, chains=2), least_squares(one)
-        return self[name]
-
-
 @pytest.fixture(scope="module")
-def calibrations(paper_posterior):
-    """Posterior and least squares of 20 particles, and of one."""
-    return Calibrations(paper=(paper_posterior, least_squares(paper_campaign(0))))
+def calibrated(paper_posterior):
+    """Posterior and least squares of 20 particles or of one, which compiles again, where they are first asked for."""
+
+    @functools.cache
+    def calibrated(kind):
+        if kind == "paper":
+            return paper_posterior, least_squares(paper_campaign(0))
+        one = paper_campaign(0).select(np.arange(20) == 3)
+        return sample(one, draws=200, chains=2), least_squares(one)
+
+    return calibrated
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -55,9 +54,9 @@ def kind(request):
 
 
 @pytest.fixture(scope="module")
-def figures(calibrations, kind, tmp_path_factory):
+def figures(calibrated, kind, tmp_path_factory):
     """Every figure, drawn and written."""
-    posterior, squares = calibrations[kind]
+    posterior, squares = calibrated(kind)
     settings = dict(mpl.rcParams)
     found = posterior_figures(posterior) | least_squares_figures(squares)
     files = save_figures(found, tmp_path_factory.mktemp(kind), dpi=100)
@@ -86,15 +85,13 @@ def test_every_figure_has_its_panels(figures, kind):
     assert {stem: len(panels(figure)) for stem, figure in figures.items()} == expected
 
 
-@pytest.mark.extended
 def test_words_and_layout(figures):
     check_words(figures)
     check_layout(figures, ticks=True)
 
 
-@pytest.mark.extended
-def test_what_must_not_be_relied_on_is_said(calibrations):
-    posterior, squares = calibrations["one"]
+def test_what_must_not_be_relied_on_is_said(calibrated):
+    posterior, squares = calibrated("one")
     assert not posterior.converged
     assert any(t.startswith("Not converged: ") for t in texts(plot_pairs(posterior)))
     assert any(t.startswith("The data leave this combination open: ") for t in texts(plot_whitened(squares)))
@@ -108,8 +105,8 @@ def test_what_must_not_be_relied_on_is_said(calibrations):
 # ---- coefficients ----------------------------------------------------------------------------------------------------
 
 
-def test_forest_has_a_row_for_every_particle(figures, calibrations, kind):
-    posterior, squares = calibrations[kind]
+def test_forest_has_a_row_for_every_particle(figures, calibrated, kind):
+    posterior, squares = calibrated(kind)
     for stem, calibration in (("forest", posterior), ("estimates", squares)):
         count = len(calibration.particles)
         first = panels(figures[stem])[0]
@@ -128,8 +125,8 @@ def test_forest_has_a_row_for_every_particle(figures, calibrations, kind):
 def test_many_particles_stand_in_order_without_labels(count, rows):
     rng = np.random.default_rng(0)
     centre = rng.lognormal(size=(count, 3))
-    table = CoefficientTable(centre, centre * np.array([0.9, 1.1])[:, None, None], None, np.ones(3), np.ones((2, 3)))
-    figure, _ = draw_forest(table, [f"particle {i}" for i in range(count)])
+    wide = centre * np.array([0.9, 1.1])[:, None, None]
+    figure, _ = draw_forest([f"particle {i}" for i in range(count)], centre, wide, np.ones(3), np.ones((2, 3)))
     for j, ax in enumerate(panels(figure)):
         (dots,) = [one for one in ax.lines if one.get_marker() == "o"]
         (intervals,) = [c for c in ax.collections if isinstance(c, LineCollection)]
@@ -142,8 +139,8 @@ def test_many_particles_stand_in_order_without_labels(count, rows):
     assert (f"particle {count - 1}" in texts(figure)) == (count <= 40)
 
 
-def test_arrows_lead_from_each_particle_alone_to_its_posterior_mean(calibrations):
-    posterior = calibrations["paper"][0]
+def test_arrows_lead_from_each_particle_alone_to_its_posterior_mean(calibrated):
+    posterior = calibrated("paper")[0]
     alone, together = shrinkage(posterior)
     for ax, (i, j) in zip(panels(plot_shrinkage(posterior)), ((0, 1), (2, 1), (0, 2)), strict=True):
         (arrows,) = [c for c in ax.collections if isinstance(c, Quiver)]
@@ -156,8 +153,8 @@ def test_arrows_lead_from_each_particle_alone_to_its_posterior_mean(calibrations
 # ---- curves ----------------------------------------------------------------------------------------------------------
 
 
-def test_grids_show_every_used_point(calibrations):
-    posterior, squares = calibrations["paper"]
+def test_grids_show_every_used_point(calibrated):
+    posterior, squares = calibrated("paper")
     for plot, calibration in ((plot_bands, posterior), (plot_fits, squares)):
         strips = panels(plot(calibration))[1::2]
         tests = calibration.selection.tests
@@ -170,14 +167,14 @@ def test_grids_show_every_used_point(calibrations):
             np.testing.assert_array_equal(forces, np.sort(read[np.asarray(tests.mask[row])[: len(rows)]]))
 
 
-def test_the_band_holds_the_measured_points(calibrations):
-    titles = [ax.get_title(loc="left") for ax in panels(plot_bands(calibrations["paper"][0]))[::2]]
+def test_the_band_holds_the_measured_points(calibrated):
+    titles = [ax.get_title(loc="left") for ax in panels(plot_bands(calibrated("paper")[0]))[::2]]
     inside = [float(re.search(r"(\d+) % inside", title).group(1)) for title in titles]
     assert 92 < np.mean(inside) < 98
 
 
-def test_new_particle(calibrations):
-    posterior = calibrations["paper"][0]
+def test_new_particle(calibrated):
+    posterior = calibrated("paper")[0]
     up, down = panels(plot_new_particle(posterior, (150.0, 140.0, 120.0)))
     loading, unloading = up.lines[-1], down.lines[-1]
     assert loading.get_xdata()[-1] == unloading.get_xdata()[0]
@@ -188,8 +185,8 @@ def test_new_particle(calibrations):
             plot_new_particle(posterior, bad)
 
 
-def test_whitened_residuals_are_standard(calibrations):
-    squares = calibrations["paper"][1]
+def test_whitened_residuals_are_standard(calibrated):
+    squares = calibrated("paper")[1]
     figure = plot_whitened(squares)
     drawn = sum(len(ax.collections[0].get_offsets()) for ax in panels(figure)[:2])
     assert drawn == int(squares.selection.tests.mask.sum())
