@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from importlib.resources import files
 from typing import Any
@@ -16,7 +15,6 @@ from ..calibrate.curves import KINDS, FittedCurve, measured_curves
 from ..plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION
 from .read import Results
 
-ROOTS = ("chart-curve", "chart-residual")
 LOOKS = {
     "load": ("circle", BLUE, "loading"),
     "hold": ("diamond", ORANGE, "hold"),
@@ -35,10 +33,10 @@ FEWEST = 40  # of one particle, at least; of more particles than that allows, th
 def compare(results: Results) -> list[FittedCurve]:
     """Every particle, or those that the law misses by most if there are too many; empty without tests."""
     if results.saved is not None:
-        curves: Sequence[FittedCurve] = results.saved.curves
+        curves = results.saved.curves
+    elif results.campaign is not None:
+        curves = measured_curves(results.campaign)
     else:
-        curves = () if results.campaign is None else measured_curves(results.campaign)
-    if not curves:
         return []
     worst_first = np.argsort([-(one.rms_um or 0.0) for one in curves], kind="stable")
     chosen = np.sort(worst_first[: POINTS // FEWEST])
@@ -87,12 +85,9 @@ def chart_items() -> dict[str, Any]:
     tips |= {"displacement": "@displacement{0.000} µm", "test − law": "@residual{0.0000} µm"}
     tips |= {"time": "@time{0.0} s", "compared": "@compared"}
     for figure, x, y in ((curve, "displacement", "force"), (residual, "time", "residual")):
-        marks = figure.scatter(
-            x, y, source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
-        )
-        figure.add_tools(
-            HoverTool(tooltips=list(tips.items()), renderers=[marks], limit=1, description="Values of a point")
-        )
+        marks = figure.scatter(x, y, source=points, marker="marker", color="colour", alpha="alpha", size=6)
+        hover = HoverTool(tooltips=list(tips.items()), renderers=[marks], limit=1, description="Values of a point")
+        figure.add_tools(hover)
     document = Document()
     for root in (curve, residual):
         document.add_root(root)
@@ -101,7 +96,7 @@ def chart_items() -> dict[str, Any]:
     names = {name: f"model-{i}" for i, name in enumerate(dict.fromkeys(re.findall(r'"id": ?"([^"]+)"', text)))}
     for name, other in names.items():
         text = text.replace(f'"{name}"', f'"{other}"')
-    roots = {names[curve.id]: ROOTS[0], names[residual.id]: ROOTS[1]}
+    roots = {names[curve.id]: "chart-curve", names[residual.id]: "chart-residual"}
     items = [{"docid": "chart", "roots": roots, "root_ids": list(roots)}]
     return {"docs": {"chart": json.loads(text)}, "items": items}
 

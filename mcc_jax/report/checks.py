@@ -26,8 +26,7 @@ GOOD_MISFIT = 0.01
 GOOD_NOISE_SHARE = 0.2
 INSIDE = (0.90, 0.99)
 NOT_MONOTONE = 0.05
-FEW_PARTICLES = 6
-"""Fewer say little of the scatter between particles."""
+FEW_PARTICLES = 6  # fewer say little of the scatter between particles
 OF_FINDINGS: dict[str, tuple[Level, str]] = {
     "info": ("good", "settled"),
     "warning": ("look", "look at it"),

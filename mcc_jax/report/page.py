@@ -7,6 +7,7 @@ import re
 from functools import cache
 from typing import Any
 
+from .. import arguments
 from .._extras import extra
 from .._format import interval, listed, number, percent, plain, probability, with_sd
 from .._types import Progress
@@ -63,17 +64,9 @@ WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=
 def report_page(results: Results, *, progress: Progress | None = None) -> str:
     """One self-contained HTML page of what `read_results` gives; equal input, equal page.
 
-    `progress` is called with the name of each step.
-
-    Raises:
-        RuntimeError: in single precision.
+    `progress` is called with the name of each step. Raises `RuntimeError` in single precision.
     """
-    import jax
-
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            'the report needs double precision; call jax.config.update("jax_enable_x64", True) before anything else'
-        )
+    arguments.double_precision("the report")
     with extra("report"):
         import bokeh  # noqa: F401
     progress = progress or (lambda _: None)
@@ -118,8 +111,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     sentences = [] if results.calibration is None else [*texts.calibration_sentences(results.calibration, results.law)]
     if results.discovery is not None:
         sentences.insert(0, headline(results.discovery, "simulated tests" if simulated else "tests"))
-    count = 0 if campaign is None else len(campaign)
-    measured_only = f"{count} particles were measured; nothing has been calibrated on them yet."
+    measured_only = f"{len(campaign or ())} particles were measured; nothing has been calibrated on them yet."
     return {
         "results": results,
         "version": __version__,

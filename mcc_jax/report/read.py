@@ -26,8 +26,7 @@ ARCHIVES = {CALIBRATION: ARCHIVE, DISCOVERY: DISCOVERY_ARCHIVE}
 DATA = ("particles.csv", "curves.csv")
 FIGURE = re.compile(r"figures/([A-Za-z0-9_-]+)\.png")
 PNG = b"\x89PNG\r\n\x1a\n"
-LARGEST_FIGURE = 2**21
-"""Bytes; a page must stay small enough to send."""
+LARGEST_FIGURE = 2**21  # bytes; a page must stay small enough to send
 A_FOLDER, AGAIN = "Give a folder that mcc-jax demo, calibrate or discover wrote into", "Calibrate or discover again"
 
 
@@ -86,11 +85,6 @@ class Results:
     __repr__ = described()
 
     @property
-    def posterior(self) -> Posterior | None:
-        """The calibration, if it is one by draws of a posterior."""
-        return self.saved if isinstance(self.saved, Posterior) else None
-
-    @property
     def with_discovery(self) -> Results:
         """What a page shows: of the law with what discovery added where that may be believed, else as it is.
 
@@ -125,12 +119,12 @@ class Results:
     def missing(self) -> tuple[str, ...]:
         """What is not there, and how to get it."""
         parts = (
-            (self.campaign, "the tests (name their folder with --campaign CAMPAIGN)"),
-            (self.calibration, "a calibration (mcc-jax calibrate makes one)"),
-            (self.posterior, "a posterior (mcc-jax calibrate makes one)"),
-            (self.discovery, "a discovery (mcc-jax discover makes one)"),
+            (self.campaign is not None, "the tests (name their folder with --campaign CAMPAIGN)"),
+            (self.saved is not None, "a calibration (mcc-jax calibrate makes one)"),
+            (isinstance(self.saved, Posterior), "a posterior (mcc-jax calibrate makes one)"),
+            (self.found is not None, "a discovery (mcc-jax discover makes one)"),
         )
-        return tuple(text for part, text in parts if part is None)
+        return tuple(text for there, text in parts if not there)
 
     @property
     def results(self) -> dict[str, dict[str, Any]]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.style import context
 from matplotlib.transforms import ScaledTranslation
@@ -22,8 +21,7 @@ from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, VERMILION, Look, 
 from .read import Results
 from .texts import quantity
 
-FEWEST = 12
-"""Least number of readings in the enlarged part of a test that has them."""
+FEWEST = 12  # least number of readings in the enlarged part of a test that has them
 
 
 @dataclass(frozen=True)
@@ -129,35 +127,31 @@ def most_informative_test(found: Discovery) -> Example | None:
 @context(["default", RC, {"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}])  # equal pages; text stays text
 def example_pictures(example: Example) -> list[tuple[str, str]]:
     """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
-    pictures: tuple[tuple[Callable[..., list[Any]], str, str], ...] = (
-        (
-            draw_enlarged,
-            "where law and test differ, enlarged",
-            "Force over displacement, enlarged where they differ most",
-        ),
-        (draw_left_over, "test minus law, over time", "Measured less predicted displacement over time"),
-    )
     found = []
-    for draw, title, words in pictures:
+    for draw, title, words in (
+        (_enlarged, "where law and test differ, enlarged", "Force over displacement, enlarged where they differ most"),
+        (_left_over, "test minus law, over time", "Measured less predicted displacement over time"),
+    ):
         figure = new_figure(4.6, 3.6)  # no wider than a phone, where its type is read at the size in which it is set
         ax = figure.subplots()
-        handles = draw(ax, example)
+        draw(ax, example)
         ax.set_title(title, fontsize=9.5, color=BLACK, pad=4)
-        figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.6)
+        figure.legend(loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.6)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
         found.append((data_uri(stream.getvalue(), "svg+xml"), f"{words}: {example.caption}"))
     return found
 
 
-def draw_enlarged(ax: Axes, example: Example) -> list[Any]:
-    """Force over displacement where law and test differ most, in a corner the whole test; entries of a legend."""
+def _enlarged(ax: Axes, example: Example) -> None:
+    """Force over displacement where law and test differ most, in a corner the whole test."""
     across, up = example.displacement_um[example.near], example.force_mN[example.near]
     width, height = float(np.ptp(across)), float(np.ptp(up))
-    dots: Look = {"marker": "o", "linestyle": "", "color": PALE, "markeredgecolor": GREY, "markeredgewidth": 0.4}
+    dots: Look = {"color": PALE, "markeredgecolor": GREY, "markeredgewidth": 0.4}
+    dots["label"] = "simulated test" if example.simulated else "measured"
     inset = ax.inset_axes(_emptiest(across, up))
     for panel, scale in ((ax, 1.0), (inset, 0.3)):
-        panel.plot(example.displacement_um, example.force_mN, markersize=4.5 * scale, **dots)
+        panel.plot(example.displacement_um, example.force_mN, "o", markersize=4.5 * scale, **dots)
         for away, look in example.laws:
             line = look | {"linewidth": scale * look["linewidth"]}
             panel.plot(example.displacement_um - away, example.force_mN, **line)
@@ -170,22 +164,18 @@ def draw_enlarged(ax: Axes, example: Example) -> list[Any]:
     frame: Look = {"fill": False, "edgecolor": BLACK, "linewidth": 1.1, "zorder": 9}
     inset.add_patch(Rectangle((across.min(), up.min()), width, height, **frame))
     _arrows(ax, example)
-    test = Line2D([], [], markersize=4.5, label="simulated test" if example.simulated else "measured", **dots)
-    return [test, *(Line2D([], [], **look) for _, look in example.laws)]
 
 
-def draw_left_over(ax: Axes, example: Example) -> list[Any]:
-    """What each law leaves over time, next to the noise; entries of a legend."""
-    handles: list[Any] = []
+def _left_over(ax: Axes, example: Example) -> None:
+    """What each law leaves over time, next to the noise."""
     if example.noise_um is not None:
         look: Look = {"color": ORANGE, "alpha": 0.45, "linewidth": 0, "label": "noise (± 1 sd)"}
-        handles.append(ax.fill_between(example.time_s, -example.noise_um, example.noise_um, **look))
+        ax.fill_between(example.time_s, -example.noise_um, example.noise_um, **look)
     ax.axhline(0.0, color=GREY, linewidth=0.7)
     for away, look in example.laws:
-        handles += ax.plot(example.time_s, away, **look)
+        ax.plot(example.time_s, away, **look)
     ax.set(xlabel="time [s]", ylabel="test − law [µm]")
     ax.margins(x=0.01)
-    return handles
 
 
 def _arrows(ax: Axes, example: Example) -> None:
@@ -224,10 +214,7 @@ def data_uri(picture: bytes, kind: str = "png") -> str:
 
 
 def cards(found: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
-    """Of a discovery how much of the gap is closed, what that did to the modulus, and the amplitude.
-
-    Each is no level, a heading, the answer, and what it means.
-    """
+    """How much of the gap is closed, what that did to the modulus, the amplitudes: level, heading, answer, meaning."""
     gap = found["gap"]
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))

@@ -69,12 +69,10 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> Iter
     if law.endswith("alone"):
         return
     shape = "the shape parameter a, how much more a flat particle is strained than a sphere,"
+    both = ((shape, "a", 1.0, ""), ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"))
     known = [
         f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
-        for name, key, factor, unit in (
-            (shape, "a", 1.0, ""),
-            ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
-        )
+        for name, key, factor, unit in both
         if content[key]["interval_95"] is not None
     ]
     if content["method"] == "paper":
@@ -202,16 +200,13 @@ def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None
 
 def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
     """One line about each particle, for the line below the chart."""
-    campaign = results.campaign
-    assert campaign is not None
-    entries = {e["particle"]: e for e in results.calibration["particles"]} if results.calibration else {}
+    rows = {name: (diameters, entry) for name, diameters, _, entry in particle_rows(results)}
     facts = []
     for one in shown:
-        sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(one.name)])
-        parts = [f"D₁ × D₂ × D₃ = {sizes}\N{NO-BREAK SPACE}µm"]
-        eta = entries.get(one.name, {}).get("eta_p", {}).get("value")
-        if eta is not None:
-            parts.append(f"shape factor {number(eta, 3)}")
+        diameters, entry = rows[one.name]
+        parts = [f"D₁ × D₂ × D₃ = {' × '.join(map(number, diameters))}\N{NO-BREAK SPACE}µm"]
+        if entry is not None and entry["eta_p"]["value"] is not None:
+            parts.append(f"shape factor {number(entry['eta_p']['value'], 3)}")
         if one.why_not is not None:
             parts.append(f"not used: {one.why_not}")
         elif one.rms_um is not None:

@@ -217,12 +217,7 @@ def test_the_first_screen_tells_verdict_gap_and_modulus(page):
     read = Page(page)
     assert list(read.sections) == [name for name in ORDER if name in read.sections]
     top = read.sections["summary"]
-    for text in (
-        "The law misses frame compliance",
-        "16.000000 ± 0.000010 GPa",
-        "9.000 ± 0.050 GPa",
-        "78 % higher",
-    ):
+    for text in ("The law misses frame compliance", "16.000000 ± 0.000010 GPa", "9.000 ± 0.050 GPa", "78 % higher"):
         assert text in top, text
     assert top.index("The law misses") < top.index("Gap closed") < top.index("Effective modulus")
     for section in ("summary", "discovery"):
