@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jax
 import pytest
-from click.testing import CliRunner
 
 from mcc_jax.cli.main import cli
 
@@ -36,41 +35,26 @@ def blocks(text):
     return [Block(*match.groups(default="")) for match in FENCE.finditer(text)]
 
 
-def write(block, folder):
-    name = Path(block.title)
-    assert not name.is_absolute()
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_text(block.text, encoding="utf-8")
-
-
-def run_command(arguments):
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, f"mcc-jax {shlex.join(arguments)}\n{result.output}\n{result.exception!r}"
-
-
 RUN = [page for page, text in ALL.items() if any(b.language in ("python", "sh") for b in blocks(text))]
 
 
 @pytest.mark.extended
 @pytest.mark.parametrize("page", RUN)
 @pytest.mark.filterwarnings("default")
-def test_page_works_as_shown(page, tmp_path, monkeypatch):
+def test_page_works_as_shown(page, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "page"}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as in a reader's session
-        follow(page, names, tmp_path)
-
-
-def follow(page, names, folder):
-    """Execute the blocks of a page in order."""
-    for number, block in enumerate(blocks(ALL[page]), start=1):
-        if block.language == "python":
-            exec(compile(block.text, f"{page}, block {number}", "exec"), names)
-        elif block.language == "sh":
-            for arguments in block.commands:
-                run_command(arguments)
-        elif block.title:
-            write(block, folder)
+        for number, block in enumerate(blocks(ALL[page]), start=1):
+            if block.language == "python":
+                exec(compile(block.text, f"{page}, block {number}", "exec"), names)
+            elif block.language == "sh":
+                for arguments in block.commands:
+                    result = run(*arguments)
+                    assert result.exit_code == 0, f"{shlex.join(arguments)}\n{result.output}\n{result.exception!r}"
+            elif block.title:
+                Path(block.title).parent.mkdir(parents=True, exist_ok=True)
+                Path(block.title).write_text(block.text, encoding="utf-8")
 
 
 COMMANDS = [(page, c) for page, text in ALL.items() for b in blocks(text) for c in b.commands]
