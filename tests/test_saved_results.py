@@ -46,7 +46,7 @@ def test_a_discovery_in_its_folder_has_it_as_its_before(calibration, tmp_path):
     assert again.verdict == "NO_GAP"
     assert encode(again.before) == encode(calibration)
     assert encode(mcc.load(tmp_path / "calibration.msgpack")) == encode(calibration)
-    with pytest.raises(InputError, match="is a file"):
+    with pytest.raises(InputError, match="is no result of mcc_jax"):
         mcc.load(tmp_path / "discovery.json")
 
 
