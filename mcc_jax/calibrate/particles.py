@@ -188,8 +188,8 @@ class Drawer:
             return (keys,), (some, candidates, same)
 
         found = blocks.turns(draw_particles, (self._exact,), [turn(first) for first in range(0, draws, chunk)])
-        several = zip(*found, strict=True)
-        return ParticleDraws(*(np.concatenate([np.asarray(v).swapaxes(0, 1) for v in one])[:draws] for one in several))
+        several = ([np.asarray(v).swapaxes(0, 1) for v in one] for one in zip(*found, strict=True))
+        return ParticleDraws(*(cast(Any, np.concatenate(one)[:draws]) for one in several))
 
     def some(
         self, key: Array, which: np.ndarray, population: Population, candidates: int, *, common: bool = False
