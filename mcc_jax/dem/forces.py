@@ -35,7 +35,8 @@ class Interaction(eqx.Module):
         F_t = k_t \xi + 2 \beta \sqrt{m_{ij} k_t}\, \dot\xi, \quad |F_t| \le \mu F_n, \quad k_t = r_t k
 
     with k the initial stiffness of the contact, m_ij the reduced mass and xi the slip that the contact remembers. Where
-    Coulomb's limit is met, the slip is set back to what the limit can hold (Cundall and Strack, 1979).
+    Coulomb's limit is met, the slip is set back to what the limit can hold (Cundall and Strack, 1979). F_t acts in the
+    middle of the overlap, as in LAMMPS, or at the wall, so that pairs conserve angular momentum.
 
     Attributes:
         damping: beta, share of critical damping [-].
@@ -127,10 +128,11 @@ def pair_loads(motion: Motion, bodies: _Body, edges: Edges) -> tuple[Float[Array
     """Force and torque of all edges, or any part of them, summed over the particles, and what the edges remember."""
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
     between = jax.vmap(_between, (None, 0, 0, 0, 0, 0))
-    (force, moment, slip), overlap_max = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
+    (force, moment, slip), overlap_max, overlap = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
     on_i, on_j = force, -force
     if motion.interaction.friction is not None:  # without it there is no torque to add up
-        on_i, on_j = _load(on_i, i.radius, moment), _load(on_j, j.radius, moment)
+        half = overlap / 2
+        on_i, on_j = _load(on_i, i.radius - half, moment), _load(on_j, j.radius - half, moment)
     total = jnp.zeros((bodies.radius.shape[0], on_i.shape[1]), bodies.radius.dtype)
     total = total.at[edges.i].add(on_i).at[edges.j].add(on_j)
     total = jnp.pad(total, ((0, 0), (0, 6 - total.shape[1])))
@@ -145,8 +147,9 @@ def wall_loads(
     on_wall, columns = [], []
     for w, wall in enumerate(walls):
         against = jax.vmap(_against, (None, None, 0, 0, 0))
-        (force, moment, slip), largest = against(motion, wall, bodies, history.overlap_max[:, w], history.slip[:, w])
-        load = load + _load(force, bodies.radius, moment)
+        found = against(motion, wall, bodies, history.overlap_max[:, w], history.slip[:, w])
+        (force, moment, slip), largest, overlap = found
+        load = load + _load(force, bodies.radius - overlap, moment)
         on_wall.append(-jnp.sum(force, axis=0))
         columns.append((largest, slip))
     if not walls:
@@ -155,37 +158,39 @@ def wall_loads(
 
 
 @jax.vmap
-def _load(force: Vector, radius: Scalar, moment: Vector) -> Float[Array, " 6"]:
-    return jnp.concatenate([force, radius * moment])
+def _load(force: Vector, arm: Scalar, moment: Vector) -> Float[Array, " 6"]:
+    return jnp.concatenate([force, arm * moment])
 
 
 def _between(
     motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector
-) -> tuple[Load, Scalar]:
+) -> tuple[Load, Scalar, Scalar]:
     friction = motion.interaction.friction
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
     relative = j.velocity - i.velocity
     if friction is not None:
-        relative = relative - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
+        # The two arms add up to the distance of the centres: so angular momentum is conserved.
+        arms = i.radius - overlap / 2, j.radius - overlap / 2
+        relative = relative - jnp.cross(arms[0] * i.spin + arms[1] * j.spin, normal)
     # Without the barriers XLA computes the law again for every use of its force.
     overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
     elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
     k = recompute(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
     mass = recompute(i.mass * j.mass / (i.mass + j.mass))
     load = _contact(motion, friction, elastic, k, mass, normal, relative, slip)
-    return load, largest_overlap(overlap_max, overlap)
+    return load, largest_overlap(overlap_max, overlap), overlap
 
 
-def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> tuple[Load, Scalar]:
+def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> tuple[Load, Scalar, Scalar]:
     friction, dtype = motion.interaction.wall_friction, body.radius.dtype
     outward = -wall.normal_at(body.position).astype(dtype)
     overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
     relative = wall.velocity.astype(dtype) - body.velocity
     if friction is not None:
-        relative = relative - jnp.cross(body.radius * body.spin, outward)
+        relative = relative - jnp.cross((body.radius - overlap) * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
     load = _contact(motion, friction, elastic, body.side.k1, body.mass, outward, relative, slip)
-    return load, largest_overlap(overlap_max, overlap)
+    return load, largest_overlap(overlap_max, overlap), overlap
 
 
 def _contact(
