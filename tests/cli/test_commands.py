@@ -98,7 +98,9 @@ def test_demo_hides_an_effect_and_finds_it_and_finds_none_where_none_is(run, tmp
     assert gap["closed_fraction"] > 0.9
     assert gap["steps"][0]["chi2_per_dof"] > 3
     assert gap["steps"][-1]["chi2_per_dof"] == pytest.approx(1.0, abs=0.2)
-    assert "of the 8 particles of particles.csv" in done(run("export", out, "--format", "json", "--out", out / "law"))
+    assert "of the 8 particles of the calibrated campaign" in done(
+        run("export", out, "--format", "json", "--out", out / "law")
+    )
 
 
 def test_the_seal_fixes_what_is_hidden():

@@ -72,7 +72,8 @@ def test_full_disk(tmp_path):
     (tmp_path / "curves.csv").write_text("old")
     before = snapshot(tmp_path)
     limited = ["sh", "-c", 'ulimit -f 4; exec "$@"', "sh", *COMMAND, "simulate", "--out", tmp_path, "--points", "20"]
-    result = subprocess.run(limited, capture_output=True, text=True, timeout=100)
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}  # Python would leave halves of byte code, too
+    result = subprocess.run(limited, capture_output=True, text=True, timeout=100, env=environment)
     assert result.returncode == 2
     line = errors(result.stderr)
     assert line.count("\n") == 1
