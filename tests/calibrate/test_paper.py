@@ -48,7 +48,7 @@ def test_the_reference_can_be_named_and_used(result):
 
 @pytest.mark.extended
 def test_particles_left_out_are_listed_with_the_reason_and_are_no_reference():
-    weak = paper_campaign(0, programme=Programme.cycles(levels=(0.025,)), instrument=Instrument())
+    weak = paper_campaign(0, programme=Programme.cycles(levels=(0.02,)), instrument=Instrument())
     content = calibrate_paper(weak).to_json()
     left_out = [p for p in content["particles"] if not p["kept"]]
     assert left_out

@@ -77,7 +77,7 @@ def test_adjusted_curves_do_not_depend_on_each_test_s_zero():
 
 
 def test_particles_below_the_threshold_are_left_out_with_the_reason():
-    weak = paper_campaign(0, programme=Programme.cycles(levels=(0.025,)), instrument=Instrument())
+    weak = paper_campaign(0, programme=Programme.cycles(levels=(0.02,)), instrument=Instrument())
     with pytest.raises(ValueError, match="threshold"):
         adjust(weak, -0.1)
     adjustment = adjust(weak)
