@@ -223,6 +223,8 @@ def draw_forest(
         ax.locator_params(axis="x", nbins=5)
         ax.use_sticky_edges = False  # the band's ends are no limits of the axis
         ax.margins(x=0.04)
+        least = 5e-4 * median[j]  # half of the narrowest axis: where nothing scatters, ticks would show rounding errors
+        ax.set_xlim(min(ax.get_xlim()[0], median[j] - least), max(ax.get_xlim()[1], median[j] + least))
         # How wide intervals usually are: they may be narrower than their dots.
         half = (wide[1] - wide[0])[:, j] / (2 * centre[:, j])
         half = half[np.isfinite(half)]
