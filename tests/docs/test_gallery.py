@@ -83,7 +83,7 @@ def test_an_entry_is_complete_and_shows_a_picture(docs, monkeypatch):
 
 @pytest.mark.extended
 def test_a_plan_computed_again_gives_the_stored_numbers(docs):
-    kept, again = docs("gallery").POWER["plans"]["unload"], docs("make_power").worked_out("unload")
+    kept, again = docs("gallery").POWER["plans"]["load"], docs("make_power").worked_out("load")
     assert again["needs"] == kept["needs"]
     assert again["limits"] == pytest.approx(kept["limits"], rel=0.05)
 
