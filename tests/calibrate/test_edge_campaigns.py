@@ -132,7 +132,7 @@ def test_the_good_particles_are_recovered_all_the_same(campaign, contents, metho
 def test_selected_points_are_those_of_the_record(campaign):
     selection = select(campaign)
     tests = selection.tests
-    assert tests.force.shape == (5, 448)
+    assert tests.force.shape == (5, 320)
     assert tuple(campaign.particles[i] for i in selection.kept) == KEPT
     for row, i in enumerate(selection.kept):
         rows = selection.rows[row]
