@@ -159,6 +159,8 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     or a diameter is not positive.
     """
     path = arguments.file_path(text, "diameters")
+    if not str(text).strip():
+        raise InputError("--diameters is empty", remedy=_SIZES)
     parts = str(text).split(",")
     if len(parts) == 3 and not os.path.isfile(path):  # noqa: PTH113  # Path's raises where a name is too long
         try:
