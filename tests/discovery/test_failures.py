@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from campaigns import QUICK, SINGLE, cached, snapping, subset, with_curves
+from campaigns import QUICK, SINGLE, cached, campaign, snapping, subset, with_curves
 from helpers import INSTRUMENTS
 
 from mcc_jax.campaign import read_instrument_file
@@ -37,6 +37,13 @@ def test_one_particle():
     told = answer(hidden, library=FEW, confirm=True, experiments=True)
     assert any("rests on the noise model" in note for note in told["notes"])
     assert told["verdict"] in ("NAMED", "SET", "UNLISTED")
+
+
+def test_two_effects_that_cancel():
+    """Compliance and reverse plasticity pull in opposite directions: what is left is small, not to be misnamed."""
+    told = answer(campaign("frame_compliance=0.0004", "reverse_plasticity=0.001", seed=1))
+    named = {name for names in told["candidate_set"] for name in names}
+    assert told["verdict"] != "NAMED" or named & {"frame_compliance", "platen_sink_in", "reverse_plasticity"}
 
 
 def test_a_load_cell_that_was_not_tared_is_no_physics():
