@@ -139,6 +139,7 @@ class Blocks:
         of the particles. The arrays of a block are placed on its device once for all turns."""
         # Several processes exchange their numbers in one order; several devices share the cores as it is.
         run = side_by_side if self.processes == 1 and self._mesh is None else map
+        within = map if len(self._own) > 1 else run  # a thread a block: not as many again in each
         if self.number == 1 and self.size == self.count:
             return list(run(lambda turn: function(*turn[0], *particles, *turn[1]), turns))
         mesh = self._mesh if hasattr(function, "__wrapped__") else None
@@ -156,7 +157,7 @@ class Blocks:
                 own = *placed(turn[0]), *there
                 return function(*own, *turn[1]) if mesh is None else _on_all_devices(own, turn[1], function, mesh)
 
-            return list(run(one, turns))
+            return list(within(one, turns))
 
         return [self._gathered(list(parts)) for parts in zip(*run(some, self._own), strict=True)]
 

@@ -128,11 +128,10 @@ def pair_loads(motion: Motion, bodies: _Body, edges: Edges) -> tuple[Float[Array
     """Force and torque of all edges, or any part of them, summed over the particles, and what the edges remember."""
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
     between = jax.vmap(_between, (None, 0, 0, 0, 0, 0))
-    (force, moment, slip), overlap_max, overlap = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
+    (force, moment, slip), overlap_max, arms = between(motion, i, j, edges.active, edges.overlap_max, edges.slip)
     on_i, on_j = force, -force
     if motion.interaction.friction is not None:  # without it there is no torque to add up
-        half = overlap / 2
-        on_i, on_j = _load(on_i, i.radius - half, moment), _load(on_j, j.radius - half, moment)
+        on_i, on_j = _load(on_i, arms[0], moment), _load(on_j, arms[1], moment)
     total = jnp.zeros((bodies.radius.shape[0], on_i.shape[1]), bodies.radius.dtype)
     total = total.at[edges.i].add(on_i).at[edges.j].add(on_j)
     total = jnp.pad(total, ((0, 0), (0, 6 - total.shape[1])))
@@ -148,8 +147,8 @@ def wall_loads(
     for w, wall in enumerate(walls):
         against = jax.vmap(_against, (None, None, 0, 0, 0))
         found = against(motion, wall, bodies, history.overlap_max[:, w], history.slip[:, w])
-        (force, moment, slip), largest, overlap = found
-        load = load + _load(force, bodies.radius - overlap, moment)
+        (force, moment, slip), largest, arm = found
+        load = load + _load(force, arm, moment)
         on_wall.append(-jnp.sum(force, axis=0))
         columns.append((largest, slip))
     if not walls:
@@ -164,13 +163,13 @@ def _load(force: Vector, arm: Scalar, moment: Vector) -> Float[Array, " 6"]:
 
 def _between(
     motion: Motion, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector
-) -> tuple[Load, Scalar, Scalar]:
+) -> tuple[Load, Scalar, tuple[Scalar, Scalar]]:
     friction = motion.interaction.friction
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
+    # The two arms add up to the distance of the centres: so angular momentum is conserved.
+    arms = i.radius - overlap / 2, j.radius - overlap / 2
     relative = j.velocity - i.velocity
     if friction is not None:
-        # The two arms add up to the distance of the centres: so angular momentum is conserved.
-        arms = i.radius - overlap / 2, j.radius - overlap / 2
         relative = relative - jnp.cross(arms[0] * i.spin + arms[1] * j.spin, normal)
     # Without the barriers XLA computes the law again for every use of its force.
     overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
@@ -178,19 +177,20 @@ def _between(
     k = recompute(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
     mass = recompute(i.mass * j.mass / (i.mass + j.mass))
     load = _contact(motion, friction, elastic, k, mass, normal, relative, slip)
-    return load, largest_overlap(overlap_max, overlap), overlap
+    return load, largest_overlap(overlap_max, overlap), arms
 
 
 def _against(motion: Motion, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector) -> tuple[Load, Scalar, Scalar]:
     friction, dtype = motion.interaction.wall_friction, body.radius.dtype
     outward = -wall.normal_at(body.position).astype(dtype)
     overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
+    arm = body.radius - overlap
     relative = wall.velocity.astype(dtype) - body.velocity
     if friction is not None:
-        relative = relative - jnp.cross((body.radius - overlap) * body.spin, outward)
+        relative = relative - jnp.cross(arm * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
     load = _contact(motion, friction, elastic, body.side.k1, body.mass, outward, relative, slip)
-    return load, largest_overlap(overlap_max, overlap), overlap
+    return load, largest_overlap(overlap_max, overlap), arm
 
 
 def _contact(
