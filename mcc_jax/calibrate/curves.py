@@ -117,20 +117,30 @@ def _number(estimate: Mapping[str, Any], name: str) -> float:
 
 @dataclass(frozen=True)
 class FittedCurve:
-    """One particle's test from contact on, and what the law says of it; every array of shape (n,)."""
+    """One particle's test from contact on, and what the law says of it; every array of shape (n,).
 
-    name: str  # of the particle
-    why_not: str | None  # why it took no part in the calibration; None if it did, or it was not calibrated
-    time_s: np.ndarray  # measured, raw, as the next two
+    Attributes:
+        name: Of the particle.
+        why_not: Why it took no part in the calibration; None if it did, or it was not calibrated.
+        time_s, force_mN, displacement_um: Measured, raw.
+        kind: Index into `KINDS`.
+        used: Which points the calibration compared with the law.
+        own_um: Displacement by the law with this particle's own coefficients and zero, the mean of the posterior's
+            predictions where there are some; NaN where there is none.
+        typical_um: With those of the population's median.
+        low_um, high_um: Ends of the central 95 % of what may be measured; NaN where there is no posterior.
+    """
+
+    name: str
+    why_not: str | None
+    time_s: np.ndarray
     force_mN: np.ndarray
     displacement_um: np.ndarray
-    kind: np.ndarray  # index into `KINDS`
-    used: np.ndarray  # which points the calibration compared with the law
-    # displacement by the law with this particle's own coefficients and zero, the mean of the posterior's predictions
-    # where there are some; NaN where there is none
+    kind: np.ndarray
+    used: np.ndarray
     own_um: np.ndarray
-    typical_um: np.ndarray  # with those of the population's middle
-    low_um: np.ndarray  # ends of the central 95 % of what may be measured; NaN where there is no posterior
+    typical_um: np.ndarray
+    low_um: np.ndarray
     high_um: np.ndarray
 
     __repr__ = described()

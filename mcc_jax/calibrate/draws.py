@@ -39,19 +39,33 @@ INDEPENDENT = {"divergences": 0, "leapfrogs": 0.0}  # of draws without a sampler
 
 
 class Fit(eqx.Module):
-    """Particles, noise and population of a campaign in agreement."""
+    """Particles, noise and population of a campaign in agreement.
 
-    model: Model = eqx.field(static=True)  # what was assumed
-    tests: Tests  # the measurements
-    individual: ParticleFits  # every particle on its own
+    Attributes:
+        model: What was assumed.
+        tests: The measurements.
+        individual: Every particle on its own.
+        noise: The noise of every particle.
+        filters: Those that whiten it at the point.
+        point: Most probable numbers of every particle.
+        residual: Measured less predicted displacement there [um], 0 where masked.
+        marginal: The tests there, with every particle's own numbers integrated out.
+        mode: Of the population in unbounded coordinates, in the order of `names`.
+        covariance: Of the same.
+        converged: For particles, noise and population in turn.
+    """
+
+    model: Model = eqx.field(static=True)
+    tests: Tests
+    individual: ParticleFits
     noise: NoiseFit
-    filters: Whitening  # of the noise at the point
-    point: Point  # most probable numbers of every particle
-    residual: Float[Array, "particles points"]  # measured less predicted displacement there [um], 0 where masked
-    marginal: Marginal  # the tests there, with every particle's own numbers integrated out
-    mode: Float[Array, " d"]  # of the population in unbounded coordinates, in the order of `names`
-    covariance: Float[Array, "d d"]  # of the same
-    converged: Bool[np.ndarray, " 3"]  # for particles, noise and population in turn
+    filters: Whitening
+    point: Point
+    residual: Float[Array, "particles points"]
+    marginal: Marginal
+    mode: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    converged: Bool[np.ndarray, " 3"]
 
     def __repr__(self) -> str:
         if is_traced(self.mode):

@@ -36,13 +36,18 @@ OPEN = 1e-3  # a combination of shared parameters is open where its curvature, e
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data say of combinations of the shared parameters."""
+    """What the data say of combinations of the shared parameters.
 
-    # of the curvature, every parameter on its own scale, largest first; all would be 1 if the parameters did not
-    # interact, and 0 marks a combination that the data leave open
+    Attributes:
+        singular_values: Of the curvature, every parameter on its own scale, largest first. All would be 1 if the
+            parameters did not interact; 0 marks a combination that the data leave open.
+        directions: The combinations, one row each, in the order of `names`.
+        names: Of the parameters.
+    """
+
     singular_values: np.ndarray
-    directions: np.ndarray  # the combinations, one row each, in the order of `names`
-    names: tuple[str, ...]  # of the parameters
+    directions: np.ndarray
+    names: tuple[str, ...]
 
     __repr__ = described()
 
@@ -55,14 +60,21 @@ class Identifiability:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class LeastSquares(JointCalibration):
-    """The joint least-squares fit of a campaign."""
+    """The joint least-squares fit of a campaign.
+
+    Attributes:
+        loss: Of the residuals.
+        settings: The pooled problem.
+        solution: Where the optimiser ended.
+        agreeing_starts: How many starts ended at the same optimum, of how many.
+    """
 
     method = "least-squares"
 
-    loss: Loss  # of the residuals
-    settings: Pooled  # the pooled problem
+    loss: Loss
+    settings: Pooled
     solution: Solution
-    agreeing_starts: tuple[int, int]  # how many starts ended at the same optimum, of how many
+    agreeing_starts: tuple[int, int]
 
     def failures(self) -> list[str]:
         """Why the fit must not be called converged; empty if every optimiser met its tolerances."""
