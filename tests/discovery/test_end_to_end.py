@@ -19,9 +19,11 @@ FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
 
 @pytest.fixture(scope="module", params=["few", "all"])
 def named(request):
-    """What is found among few mechanisms, and among all."""
+    """What is found among few mechanisms, without the posterior, and among all."""
     frame = f"frame_compliance={COMPLIANCE}"
-    return found_in(frame) if request.param == "all" else discover(cached(frame), library=FEW, experiments=False)
+    if request.param == "all":
+        return found_in(frame)
+    return discover(cached(frame), library=FEW, experiments=False, posterior=False)
 
 
 def content(found):
@@ -75,14 +77,20 @@ def test_what_was_added_is_an_ordinary_part_of_the_law(named):
     assert float(built.amplitude) == pytest.approx(effect.amplitude)
     assert [v.mechanism for v in named.model.effects] == [effect.mechanism]
     assert named.outcome == named.verdict
-    name = named.base.campaign.particles[2]
-    own, typical = named.law(name), named.law()
-    assert [type(e) for e in own.effects] == [type(e) for e in typical.effects] == [type(built)]
-    assert float(own.plastic.C1) == float(named.posterior.law(name).plastic.C1) != float(typical.plastic.C1)
-    with pytest.raises(InputError, match="no particle 'none'"):
-        named.law("none")
+    assert [type(e) for e in named.law().effects] == [type(built)]
     with pytest.raises(InputError, match="takes its posterior"):
-        dataclasses.replace(named, posterior=None).law(name)
+        dataclasses.replace(named, posterior=None).law(named.base.campaign.particles[2])
+
+
+@pytest.mark.extended
+def test_a_particle_has_its_own_law_with_what_was_added():
+    found = found_in(f"frame_compliance={COMPLIANCE}")
+    name = found.base.campaign.particles[2]
+    own, typical = found.law(name), found.law()
+    assert [type(e) for e in own.effects] == [type(e) for e in typical.effects] == [type(found.effects[0].build())]
+    assert float(own.plastic.C1) == float(found.posterior.law(name).plastic.C1) != float(typical.plastic.C1)
+    with pytest.raises(InputError, match="no particle 'none'"):
+        found.law("none")
 
 
 @pytest.mark.extended
