@@ -148,8 +148,7 @@ class _Mixture:
         self._rng, self._target = np.random.default_rng(seed), target
         self._spreads = np.array(target.signed())
         d = len(target.names)
-        self._signs = np.ones((2 ** len(self._spreads), d))  # all choices
-        self._signs[:, self._spreads] = list(product((1.0, -1.0), repeat=len(self._spreads)))
+        self._flipped = np.array(list(product((0.0, 1.0), repeat=len(self._spreads))))  # all choices of signs
         # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix for singular.
         shape = cast(Any, np.eye(d) * (1 - 2 / FREEDOM))  # its stub takes a number
         self._unit = multivariate_t(np.zeros(d), shape, FREEDOM)
@@ -186,9 +185,17 @@ class _Mixture:
         return self._log_density + twice - mixture
 
     def _proposal(self, free: np.ndarray, centre: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Log density of a distribution, folded, given the inverse of its covariance's factor."""
-        white = ((free * signs - centre) @ inverse.T for signs in self._signs)
-        away = 1 + np.stack([np.einsum("nd,nd->n", z, z) for z in white]) / (FREEDOM - 2)
+        """Log density of a distribution, folded, given the inverse of its covariance's factor.
+
+        Changing the sign of x_i adds -2 x_i k_i to the whitened z, k_i the i-th column of the inverse factor, and so
+        -4 x_i (z . k_i) to its square, and 4 x_i x_j (k_i . k_j) for each pair.
+        """
+        columns, own, flipped = inverse[:, self._spreads], free[:, self._spreads], self._flipped
+        white = (free - centre) @ inverse.T
+        products = (own[:, :, None] * own[:, None, :] * (columns.T @ columns)).reshape(len(free), -1)
+        pairs = (flipped[:, :, None] * flipped[:, None, :]).reshape(len(flipped), -1)
+        change = 4 * (pairs @ products.T - flipped @ (own * (white @ columns)).T)
+        away = 1 + np.maximum(np.einsum("nd,nd->n", white, white) + change, 0.0) / (FREEDOM - 2)
         least, power = away.min(0), 0.5 * (FREEDOM + len(inverse))
         density = np.log(((least / away) ** power).sum(0)) - power * np.log(least)
         return self._constant + density + np.sum(np.log(np.diagonal(inverse)))
