@@ -120,15 +120,15 @@ class FittedCurve:
     """One particle's test from contact on, and what the law says of it; every array of shape (n,).
 
     Attributes:
-        name: Of the particle.
-        why_not: Why it took no part in the calibration; None if it did, or it was not calibrated.
-        time_s, force_mN, displacement_um: Measured, raw.
-        kind: Index into `KINDS`.
-        used: Which points the calibration compared with the law.
-        own_um: Displacement by the law with this particle's own coefficients and zero, the mean of the posterior's
+        name: of the particle.
+        why_not: why it took no part in the calibration; None if it did, or it was not calibrated.
+        time_s, force_mN, displacement_um: measured, raw.
+        kind: index into `KINDS`.
+        used: which points the calibration compared with the law.
+        own_um: displacement by the law with this particle's own coefficients and zero, the mean of the posterior's
             predictions where there are some; NaN where there is none.
-        typical_um: With those of the population's median.
-        low_um, high_um: Ends of the central 95 % of what may be measured; NaN where there is no posterior.
+        typical_um: with those of the population's median.
+        low_um, high_um: ends of the central 95 % of what may be measured; NaN where there is no posterior.
     """
 
     name: str

@@ -42,17 +42,17 @@ class Fit(eqx.Module):
     """Particles, noise and population of a campaign in agreement.
 
     Attributes:
-        model: What was assumed.
-        tests: The measurements.
-        individual: Every particle on its own.
-        noise: The noise of every particle.
-        filters: Those that whiten it at the point.
-        point: Most probable numbers of every particle.
-        residual: Measured less predicted displacement there [um], 0 where masked.
-        marginal: The tests there, with every particle's own numbers integrated out.
-        mode: Of the population in unbounded coordinates, in the order of `names`.
-        covariance: Of the same.
-        converged: For particles, noise and population in turn.
+        model: what was assumed.
+        tests: the measurements.
+        individual: every particle on its own.
+        noise: the noise of every particle.
+        filters: those that whiten it at the point.
+        point: most probable numbers of every particle.
+        residual: measured less predicted displacement there [um], 0 where masked.
+        marginal: the tests there, with every particle's own numbers integrated out.
+        mode: of the population in unbounded coordinates, in the order of `names`.
+        covariance: of the same.
+        converged: for particles, noise and population in turn.
     """
 
     model: Model = eqx.field(static=True)

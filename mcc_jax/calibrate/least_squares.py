@@ -39,10 +39,10 @@ class Identifiability:
     """What the data say of combinations of the shared parameters.
 
     Attributes:
-        singular_values: Of the curvature, every parameter on its own scale, largest first. All would be 1 if the
+        singular_values: of the curvature, every parameter on its own scale, largest first. All would be 1 if the
             parameters did not interact; 0 marks a combination that the data leave open.
-        directions: The combinations, one row each, in the order of `names`.
-        names: Of the parameters.
+        directions: the combinations, one row each, in the order of `names`.
+        names: of the parameters.
     """
 
     singular_values: np.ndarray
@@ -63,10 +63,10 @@ class LeastSquares(JointCalibration):
     """The joint least-squares fit of a campaign.
 
     Attributes:
-        loss: Of the residuals.
-        settings: The pooled problem.
-        solution: Where the optimiser ended.
-        agreeing_starts: How many starts ended at the same optimum, of how many.
+        loss: of the residuals.
+        settings: the pooled problem.
+        solution: where the optimiser ended.
+        agreeing_starts: how many starts ended at the same optimum, of how many.
     """
 
     method = "least-squares"

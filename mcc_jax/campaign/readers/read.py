@@ -158,9 +158,9 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     `particle` (or `file`, `test`), `D1_um`, `D2_um`, `D3_um` (or other units of length). `InputError` if it is neither,
     or a diameter is not positive.
     """
-    path = arguments.file_path(text, "diameters")
     if not str(text).strip():
         raise InputError("--diameters is empty", remedy=_SIZES)
+    path = arguments.file_path(text, "diameters")
     parts = str(text).split(",")
     if len(parts) == 3 and not os.path.isfile(path):  # noqa: PTH113  # Path's raises where a name is too long
         try:
