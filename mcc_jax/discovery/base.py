@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,6 +24,8 @@ from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..calibrate.running import Blocks
 from ..campaign import Campaign, find_segments
 from ..effects import Mechanism
+from ..geometry import Particle
+from ..law import Unloading
 from .settings import DECISIONS
 
 Library = Mapping[str, Mechanism]
@@ -84,7 +87,32 @@ class Base:
     def snaps(self) -> np.ndarray:
         """Where the law snaps through below a test's largest force: there no displacement belongs to a force."""
         log_force = np.asarray(snaps(self.state.point.latent, self.tests.particle))
-        return log_force < np.log(np.max(np.where(self.tests.mask, self.tests.force, 1e-300), axis=1))
+        return log_force < np.log(self._largest_force)
+
+    @property
+    def _largest_force(self) -> np.ndarray:
+        return np.max(np.where(self.tests.mask, self.tests.force, 1e-300), axis=1)
+
+    def in_form(self, unloading: Unloading) -> Base:
+        r"""The same tests and the law in another form of unloading, with moduli by which their peaks unload as before.
+
+        .. math:: k' (E'/\sigma_P)^{n'} = k (E/\sigma_P)^n
+        """
+        model, form, point = self.model, self.model.unloading, self.state.point
+        modulus = in_own_units(self.campaign, Model(unloading))[0].chosen_priors.effective_modulus_MPa
+        model = replace(model, unloading=unloading, priors=replace(model.chosen_priors, effective_modulus_MPa=modulus))
+        log_stress = np.log(jax.vmap(Particle.stress)(self.tests.particle, jnp.asarray(self._largest_force)))
+        power = form.stress_power / unloading.stress_power
+        constant = np.log(form.constant / unloading.constant) / unloading.stress_power
+
+        def changed(log_modulus: Any, log_stress: Any) -> Any:
+            return log_stress + power * (log_modulus - log_stress) + constant
+
+        latent, population = np.array(point.latent), np.array(self.state.population)
+        latent[:, 3] = changed(latent[:, 3], log_stress)
+        population[1] = changed(population[1], log_stress.mean())
+        state = State(replace(point, latent=jnp.asarray(latent)), jnp.asarray(population))
+        return replace(self, model=model, state=state)
 
 
 def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, progress: Progress) -> Base:

@@ -22,17 +22,19 @@ from ..campaign import Campaign, Finding, available_data, campaign_findings, che
 from ..campaign.findings import named
 from ..campaign.force_zero import open_zero
 from ..effects import LIBRARY, Mechanism
+from ..law import Unloading
 from . import answer
 from .base import Base, Library, base_fit
 from .closure import closure
 from .design import design_of
+from .fit import fit_hypothesis
 from .hypothesis import Names
 from .plan import next_experiments, without_effects
 from .result import Discovery
 from .screen import located, untestable, without_punch
 from .search import Search
-from .sentences import summary_of, taken_back
-from .settings import AT_PEAKS, UNLISTED
+from .sentences import FORM, summary_of, taken_back
+from .settings import AT_PEAKS, STRONG, UNLISTED
 from .verify import held_out, p_anything
 
 Fit = Callable[[Campaign], Base]  # of the base law
@@ -97,7 +99,7 @@ def discover(
     search = begun(campaign, findings)
     _run(search, seed)
     if search.is_gap:
-        search = _not_tared(campaign, search, begun, seed) or search
+        search = _not_tared(campaign, search, begun, seed) or _other_form(search, assumed, seed) or search
     base, findings = search.base, (*findings, *search.left_out)
     ranking = answer.ranking_of(search)
     # By the law alone, under the model's own noise: those of a calibration.
@@ -216,6 +218,34 @@ def _not_tared(campaign: Campaign, search: Search, begun: Callable[..., Search],
     )
     remedy = "Take a record that begins in the air; if the particles were preloaded, something is missing after all"
     other.left_out.insert(0, Finding("zero of force", "warning", text, remedy))
+    return other
+
+
+def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
+    """The search in the other form of the law's unloading, if the tests follow that one; else None.
+
+    The two punch forms give the same curves with other moduli: they are one hypothesis.
+    """
+    if assumed.priors is not None:  # those of the modulus belong to the form that was asked for
+        return None
+    asked = search.base.model.unloading
+    form = Unloading.PUNCH if asked is Unloading.PRINTED else Unloading.PRINTED
+    base = search.base.in_form(form)
+    with numbers_in_reach(base.campaign):
+        alone = fit_hypothesis(base, base.state, (), (), search.null.optimum.hyper)
+        if alone.log_evidence < search.null.log_evidence + STRONG:
+            return None
+        search.progress("the same in the law's other form of unloading")
+        other = Search(base, search.library, search.whole, search.progress)
+    _run(other, seed)
+    best, other_best = (max(one.log_posteriors().values()) for one in (search, other))
+    if other_best < best + STRONG:
+        return None
+    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r}"
+    remedy = f"Calibrate in this form, Model(unloading={form.value!r}): the modulus belongs to it"
+    text = f"{text} (log evidence larger by {other_best - best:.0f})"
+    found = Finding("form of unloading", "warning", text, remedy, code=FORM)
+    other.untestable, other.left_out = search.untestable, [found, *search.left_out]
     return other
 
 

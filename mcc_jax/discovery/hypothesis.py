@@ -29,7 +29,7 @@ SCATTER, SPREAD = NakagamiPrior(DECISIONS.scatter), NakagamiPrior(1.0, shape=0.2
 FOLLOWED = 4  # times at most that the prior of a misfit follows the amplitude of its formula
 AGREE = 0.1  # difference of the logarithms of the two at which it need not
 DRIFTS = 6  # drifts of every test's own that are fitted at their own optimum
-MOST_STEPS = 3  # sudden ones of one test
+MOST_STEPS = 12  # sudden ones of one test
 
 
 @dataclass

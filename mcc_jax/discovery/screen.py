@@ -118,7 +118,7 @@ def without_punch(library: Library, base: Base) -> dict[str, Mechanism]:
     diameter, tests = base.campaign.metadata.punch_diameter_um, base.tests
     ends = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1)
     travel = np.maximum(ends - np.asarray(base.state.point.zero), 0.0)
-    widest = float(np.max(np.sqrt(PUNCH_AREA * np.asarray(tests.effective_diameter) * travel)))
+    widest = float(np.max(np.sqrt(PUNCH_AREA * np.asarray(tests.effective_diameter) * travel / 2)))
 
     def known(variant: Variant) -> Variant | None:
         others = tuple(n for n in variant.nuisances if n.name != PUNCH)

@@ -34,7 +34,7 @@ class Search:
     def __init__(self, base: Base, library: Library, whole: Library, progress: Progress) -> None:
         """Fit the law alone; `library` has what is searched for, `whole` also formulas that the tests cannot show."""
         base, start = with_likely_noise(base)
-        self.base, self.library, self.progress = base, library, progress
+        self.base, self.library, self.whole, self.progress = base, library, whole, progress
         places = [base.state]
         if base.coarse:
             places += [at_priors(base, rows) for rows in (base.snaps, np.ones(len(base.tests), bool)) if rows.any()]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .result import Discovery, Effect
 
 NOTHING_MISSING = "nothing missing"
+FORM = "form"  # code of the finding that the tests follow another form of unloading than was asked for
 JUMPS, CHECKS = 5, 3  # sudden steps and checks that a summary lists
 
 
@@ -68,7 +69,7 @@ def taken_back(names: Sequence[str], objection: str) -> str:
 
 def summary_of(found: Discovery) -> str:
     """One paragraph: what is missing, where, how sure, what that did, what next."""
-    sentences = [_verdict(found)]
+    sentences = [f"{one.sentence}." for one in found.findings if one.code == FORM] + [_verdict(found)]
     for effect, names in zip(found.effects, found.candidate_set, strict=True):
         sentences += _effect(effect, names, found.pairs)
     if found.closure is not None:

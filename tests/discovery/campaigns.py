@@ -38,13 +38,16 @@ def peaks_at(stress_MPa, diameters):
     return stress_MPa * np.pi / 4 * (D1 * D2 / D3) ** 2 * 1e-3
 
 
-def campaign(*effects, seed=0, programme=FULL, particles=N, peaks_MPa=None, humidity=None, instrument=INSTRUMENT):
+def campaign(
+    *effects, seed=0, programme=FULL, particles=N, peaks_MPa=None, humidity=None, instrument=INSTRUMENT,
+    form=(16_000.0, "printed"),
+):  # fmt: skip
     """Particles of the paper's sizes, monotone draws of its coefficients, effects as text."""
     rng = np.random.default_rng([seed, 5])
     diameters = PAPER_DIAMETERS_UM[rng.permutation(20)[:particles]]
     stress = rng.uniform(7, 16, particles) if peaks_MPa is None else np.asarray(peaks_MPa, float)
     return simulate_campaign(
-        law_for_each(monotone_draws(seed, particles), 1.43, 16_000.0),
+        law_for_each(monotone_draws(seed, particles), 1.43, *form),
         diameters,
         peaks_at(stress, diameters),
         programme,
