@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcc_jax.dem import half_contact, pair_force, pair_recovery, pair_split
+from mcc_jax.effects import clean_record
 from mcc_jax.geometry import Particle
 from mcc_jax.law import TESTED_STRAIN, History, MccLaw, Plastic
 
@@ -52,6 +53,45 @@ def choices(seed, count):
     depth = np.where(rng.random((count, TURNS)) < 0.3, 1.2, rng.uniform(0, 1.2, (count, TURNS)))
     depth[:, -1] = 1.2  # what can be got back is got back
     return tuple(map(jnp.asarray, (10**peaks, partial, depth)))
+
+
+RAMP = 24  # points of each ramp of a path of force
+
+
+def with_effect(variant, law, particle, seed, count):
+    """Energy put in and got back along paths of force with a formula, each path with numbers of its own."""
+    rng = np.random.default_rng(seed + 2)
+
+    def drawn(low, high):
+        return np.exp(rng.uniform(np.log(low), np.log(high), count)) if low > 0 else rng.uniform(low, high, count)
+
+    sign = rng.choice([-1, 1], count) if variant.sign == 0 else variant.sign
+    numbers = {n.name: jnp.asarray(drawn(*n.plausible)) for n in variant.nuisances}
+    amplitude = jnp.asarray(sign * drawn(*variant.plausible))
+    # Stresses of 0.1 to 20 MPa at the peaks; every third ramp back up ends below the peak before.
+    stress = 10 ** np.cumsum(np.column_stack([rng.uniform(-1, 1, count), rng.uniform(0, 0.06, (count, TURNS - 1))]), 1)
+    tops = stress * np.where(rng.random(stress.shape) < 1 / 3, rng.random(stress.shape), 1.0)
+    lows = tops * np.where(rng.random(tops.shape) < 0.3, 0.0, rng.random(tops.shape))
+    lows[:, -1] = 0.0
+    turns = np.stack([tops, lows], -1).reshape(count, -1)
+    ends = np.concatenate([np.zeros((count, 1)), turns], 1)
+    share = np.linspace(0, 1, RAMP + 1)[1:]
+    path = (ends[:, :-1, None] + np.diff(ends, axis=1)[..., None] * share).reshape(count, -1)
+    times = np.cumsum(np.repeat(10 ** rng.uniform(-1, 3, turns.shape) / RAMP, RAMP, axis=1), 1)
+    humidity = jnp.asarray(rng.uniform(5, 95, count))
+
+    def one(law, particle, amplitude, numbers, stress, time, humidity):
+        effect = variant.build(amplitude, **numbers)
+        force = particle.force(jnp.append(0.0, stress))
+        record = clean_record(force, jnp.append(0.0, time), relative_humidity=humidity)
+        moved = law.with_effects(effect).respond(particle, record)
+        work = 0.5 * (force[1:] + force[:-1]) * jnp.diff(moved)
+        return jnp.sum(jnp.maximum(work, 0.0)), -jnp.sum(jnp.minimum(work, 0.0))
+
+    found = eqx.filter_jit(eqx.filter_vmap(one))(
+        law, particle, amplitude, numbers, *map(jnp.asarray, (path, times)), humidity
+    )
+    return tuple(map(np.asarray, found))
 
 
 def _walk(force, recovered, reach, peaks, partial, depth):

@@ -14,12 +14,13 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
 from .._types import Scalar, Values
-from .effect import AbstractEffect, pick
+from .effect import AbstractEffect, at_least, pick
 from .record import HOLD, RELOAD, UNLOAD, Context, power, reload_progress
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_TIME_S = 100.0
 SPACING = math.log(10) / 2  # of elements in ln(time): two per decade
+HALF_WIDTHS = (np.arange(8) + 0.5) / 16  # of plays, in shares of the peak load
 NORM = 27 / 4  # makes the largest value of x (1 - x)^2 one
 
 Elements = Float[Array, " elements"]
@@ -61,11 +62,23 @@ class LinearCreep(AbstractEffect):
         memory = decay * memory + (mean - decay) * before + (1 - mean) * now
         return memory, memory
 
-    def inside(self, context: Context) -> Values:
+    def crept(self, context: Context) -> Values:
+        """The stress of the hereditary integral [MPa]."""
         _, weights, instant = self.of()
         weights = weights.reshape((1,) * (context.memory.ndim - 1) + weights.shape)
-        strain = jnp.sum(context.memory * weights, axis=-1) + instant * context.stress
-        return self.amplitude * context.particle.displacement(strain)
+        return jnp.sum(context.memory * weights, axis=-1) + instant * context.stress
+
+    def inside(self, context: Context) -> Values:
+        return self.amplitude * context.particle.displacement(self.crept(context))
+
+
+class GrowingContact(LinearCreep):
+    """Linear viscoelastic creep of a growing contact: d^(3/2), not d, follows the hereditary integral of stress."""
+
+    def inside(self, context: Context) -> Values:
+        loaded = context.peak_stress > 1e-6
+        ratio = jnp.where(loaded, self.crept(context) / jnp.where(loaded, context.peak_stress, 1.0), 0.0)
+        return context.peak_displacement * (jnp.cbrt(at_least(1 + self.amplitude * ratio)) ** 2 - 1)
 
 
 def _one_time(tau: Scalar) -> Spectrum:
@@ -174,6 +187,10 @@ CREEP = family(LinearCreep, "creep",
         "A spring in parallel with a dashpot: delayed, bounded and fully recovered.",
         _tau(5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0),
         source="Zhupanska et al. (2002), creep and relaxation of MCC; Oyen and Cook (2003), J. Mater. Res. 18, 139"),
+    row("growing_contact", "tau dy/dt + y = sigma; d = gamma_P [(1 + c y / sigma_P)^(2/3) - 1]",
+        "A Kelvin-Voigt solid under a round contact, which grows while it creeps.", _tau(10.0, 40.0, 160.0),
+        source="Lee and Radok (1960), J. Appl. Mech. 27, 438; Ting (1966), J. Appl. Mech. 33, 845", make=GrowingContact,
+        formula="kelvin_voigt", parameter="creep_share", unit="-", plausible=(1e-3, 0.3)),
     row("logarithmic", "d = D_e c [ln(1 + t / tau) convolved with d sigma]",
         "Many retardation times: slower and slower, without end.", _tau(1.0, 10.0, 100.0),
         source="Nowick and Berry (1972), ch. 4"),
@@ -228,6 +245,32 @@ class ReloadHysteresis(AbstractEffect):
         return -self.amplitude * context.recoverable * (1 - context.reload_from_share) * lag
 
 
+class PlayHysteresis(AbstractEffect):
+    """A loop by play elements, with return-point memory: an inner loop closes, and the outer one goes on as without it.
+
+    An element of the half width r follows the load share u by a play, p <- min(max(p, u - r), u + r). What counts is
+    how far it lags behind its course on unloading from the peak, min(u + r, 1 - r). Widths are evenly distributed up
+    to 1/2, so that elements yield one after the other. It dissipates in every loop.
+    """
+
+    def driver(self, context: Context) -> Values:
+        return context.load_share
+
+    def start(self, like: Scalar) -> Elements:
+        return jnp.asarray(1 - HALF_WIDTHS, like.dtype)
+
+    def evolve(self, memory: Elements, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Elements, Elements]:
+        width = jnp.asarray(HALF_WIDTHS, now.dtype)
+        memory = jnp.clip(memory, now - width, now + width)
+        return memory, memory
+
+    def inside(self, context: Context) -> Values:
+        width = jnp.asarray(HALF_WIDTHS, context.memory.dtype)
+        width = width.reshape((1,) * (context.memory.ndim - 1) + width.shape)
+        behind = jnp.minimum(context.load_share[..., None] + width, 1 - width) - context.memory
+        return -self.amplitude * context.recoverable * 4 * jnp.mean(behind, axis=-1)
+
+
 HYSTERESIS = family(ReloadHysteresis, "reload_hysteresis",
     "Reloading does not retrace unloading: a loop opens that dissipates work at any rate.",
     row("parabolic", "d = -Delta h (1 - u_r) 4 w (1 - w), w = (F - F_r) / (F_P - F_r)",
@@ -235,6 +278,9 @@ HYSTERESIS = family(ReloadHysteresis, "reload_hysteresis",
     row("early", "d = -Delta h (1 - u_r) 6.75 w (1 - w)^2", "Widest soon after the reversal."),
     row("late", "d = -Delta h (1 - u_r) 6.75 w^2 (1 - w)", "Widest close to the peak."),
     row("slip", "d = -Delta h (1 - u_r) (1 - exp(-20 w)) (1 - w)", "Friction at the contact is overcome first."),
+    row("return_point", "d = -Delta h [mean over r of min(u + r, 1 - r) - p_r] 4, p_r a play of half width r < 1/2",
+        "Friction that is overcome in one place after the other; inner loops close.", make=PlayHysteresis,
+        source="Masing (1926); Iwan (1966), J. Appl. Mech. 33, 893; Krasnosel'skii and Pokrovskii (1989)"),
     parameter="lag_share", plausible=(0.01, 0.5),
     source="Kadin, Kligerman and Etsion (2006), Int. J. Solids Struct. 43, 7119; Zait et al. (2010)",
     needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD, Need.TWO_RATES),

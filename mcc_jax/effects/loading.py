@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values
-from ..formulas import PUNCH_AREA, Formulas, recovery
+from ..formulas import Formulas, recovery
 from ..geometry import Particle
 from .effect import AbstractEffect, Factors, at_least, on_terms, pick
-from .record import Context, Record, contact_radius, positive, power, root
+from .record import SMALL, Context, Record, contact_radius, positive, power
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_FORCE_RATE = 2.0  # mN/s
@@ -66,6 +66,8 @@ class RateOfFlowAndModulus(RateDependence):
 
 _EYRING = "Eyring (1936), J. Chem. Phys. 4, 283; Ree and Eyring (1955), J. Appl. Phys. 26, 793"
 _ACTIVATED = Nuisance("rate_share", (0.1, 1.0, 10.0), (0.01, 100.0), "strain rate of the crossover over 0.002/s")
+_OVERSTRESS = Nuisance("exponent", (0.2, 0.5), (0.05, 1.0), "power of the strain rate")
+_COWPER = "Cowper and Symonds (1957), Brown University, Div. Appl. Math. Report 28"
 _TWO_RATES = (Need.TWO_RATES,)  # the other rates vary along one test and from size to size: one force rate shows them
 _YIELD, _HARDENING = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -82,8 +84,7 @@ RATE = family(RateDependence, "rate_dependence",
     row("flow_power_stress_rate", "sigma(eps) (sigma' / 0.05 MPa/s)^m", "Flow stress as a power of the stress rate.",
         formula="power", rate_of="stress"),
     row("cowper_symonds", "sigma(eps) (1 + m (eps' / 0.002/s)^q)", "Overstress as a power of the strain rate.",
-        Nuisance("exponent", (0.2, 0.5), (0.05, 1.0), "power of the strain rate"), source="Cowper and Symonds (1957)",
-        formula="cowper_symonds"),
+        _OVERSTRESS, source=_COWPER, formula="cowper_symonds"),
     row("hardening_log_strain_rate", "C5^5 (1 + m ln(eps' / 0.002/s))",
         "Only the hardening term grows with the strain rate.", terms=_HARDENING),
     row("flow_and_modulus_log_force_rate", "sigma(eps) and E (1 + m ln(F' / 2 mN/s)), each at the rate of its own ramp",
@@ -92,12 +93,14 @@ RATE = family(RateDependence, "rate_dependence",
     row("flow_eyring", "sigma(eps) [1 + m asinh(eps' / (r 0.002/s))]",
         "Thermally activated flow: viscous at low rates, logarithmic at high ones.", _ACTIVATED, source=_EYRING,
         formula="eyring"),
+    row("yield_cowper_symonds", "C1 (1 + m (eps' / 0.002/s)^q)", "The same of the yield term C1 only.", _OVERSTRESS,
+        source=_COWPER, formula="cowper_symonds", terms=_YIELD),
     row("yield_eyring", "C1 [1 + m asinh(eps' / (r 0.002/s))]", "The same of the yield term C1 only.", _ACTIVATED,
         source=_EYRING, formula="eyring", terms=_YIELD),
     formula="logarithm", parameter="rate_sensitivity", plausible=(0.003, 0.1),
     source="Roberts and Rowe (1985), Chem. Eng. Sci. 40, 4; Schmalbach et al. (2021), J. Mater. Res.",
     helps=(Need.SEVERAL_SIZES,), equivalences=("size_effect, at one force rate",),
-    check="load at two rates or more within one class of sizes", coordinates=("peak", "rate"),
+    check="load at two rates or more within one class of sizes", coordinates=("peak", "rate", "stress_rate"),
 )  # fmt: skip
 
 
@@ -127,7 +130,9 @@ class PlatenFriction(LoadingFactor):
 
     formulas: ClassVar = {
         "siebel": lambda e, particle, eps: 1 + 2 / 3 * e.amplitude * _slenderness(particle, eps),
-        "sphere": lambda e, _, eps: 1 + 2 / 3 * e.amplitude * root(PUNCH_AREA * eps) / at_least(1 - eps, 0.1),
+        "sphere": lambda e, p, eps: (
+            1 + 2 / 3 * e.amplitude * contact_radius(p, eps) / p.displacement(at_least(1 - eps, 0.1))
+        ),
         "exponential_hill": _slab,
         "sticking": lambda e, particle, eps: 1 + e.amplitude * _slenderness(particle, eps) ** 2,
         "strain": lambda e, _, eps: 1 + e.amplitude * eps,
@@ -238,6 +243,7 @@ class Toe(AbstractEffect):
         "hyperbolic": lambda e, x: x / (1 + x),
         "logarithmic": lambda e, x: jnp.log1p(x) / jnp.log(10.0),
         "power": lambda e, x: jnp.expm1(0.25 * jnp.log1p(x)) / (10**0.25 - 1),
+        "hertz": lambda e, x: jnp.where(x < 1, 3 * (jnp.cbrt(x + SMALL) ** 2 - SMALL ** (2 / 3)) - 2 * x, 1.0),
     }
 
     def inside(self, context: Context) -> Values:
@@ -257,6 +263,10 @@ TOE = family(Toe, "toe_asperity",
     row("power", "d = D_e d_t ((1 + sigma_P / s)^(1/4) - 1) / (10^(1/4) - 1)",
         "A soft layer that gives way further and further, as a small power of stress.",
         source="Archard (1957), Proc. R. Soc. A 243, 190"),
+    row("hertz", "d = D_e d_t (3 x^(2/3) - 2 x), x = sigma_P / s, up to x = 1",
+        "No asperities: the contact is elastic, after Hertz, until it yields at the stress s and goes on with the "
+        "slope it has there, that of the law.",
+        source="Thornton and Ning (1998), Powder Technol. 99, 154; Johnson (1985), Contact Mechanics, ch. 6"),
     row("elastic", "d = D_e d_t (1 - exp(-sigma / s))", "The asperities spring back on unloading.",
         formula="exponential", springs=1.0),
     row("elastic_hyperbolic", "d = D_e d_t x / (1 + x), x = sigma / s",

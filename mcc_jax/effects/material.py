@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 
 from .._types import Scalar, Values
@@ -13,11 +14,15 @@ from ..geometry import Particle
 from .effect import AbstractEffect, AbstractModulusAtPeak, at_least, on_terms, pick
 from .loading import LoadingFactor
 from .record import REFERENCE_HUMIDITY_PERCENT, Context, Record, positive, power
-from .variant import Need, Nuisance, family, row
+from .variant import OWN, Need, Nuisance, family, row
 
 REFERENCE_DIAMETER_UM = 200.0
 REFERENCE_STRESS_MPA = 10.0
 LOCKING_STRAIN = 0.5
+WATER = 0.036, 12.0, 0.75  # isotherm of microcrystalline cellulose: monolayer [-], strength of binding, multilayers
+GLASS_K = 493.0, 136.0  # glass transitions of dry cellulose and of water [K]
+GORDON_TAYLOR = 1.55 * 493.0 / (1.0 * 136.0)  # rho T_g of cellulose over that of water (rule of Simha and Boyer)
+SIGMOID_WIDTH = 8.0  # percent of relative humidity
 
 
 def scaled(law: Formulas, first: Scalar, others: Scalar, modulus: Scalar) -> Formulas:
@@ -45,8 +50,8 @@ def _size_power(e: SizeEffect, particle: Particle, _: Record) -> Scalar:
 
 
 def _gradient(e: SizeEffect, particle: Particle, _: Record) -> Scalar:
-    grown = at_least(1 + 2 * e.amplitude * REFERENCE_DIAMETER_UM / particle.effective_diameter)
-    return jnp.sqrt(grown / at_least(1 + 2 * e.amplitude))
+    grown = at_least(1 + e.amplitude / particle.effective_diameter)
+    return jnp.sqrt(grown / at_least(1 + e.amplitude / REFERENCE_DIAMETER_UM))
 
 
 class SizeEffect(Strength):
@@ -71,10 +76,11 @@ SIZE = family(SizeEffect, "size_effect",
         "Everything depends on size, as with porosity that differs from sieve cut to sieve cut.", terms=_WHOLE),
     row("flow_mean_diameter", "sigma(eps) (mean diameter / 200 um)^-n",
         "Size is the mean of the three diameters, not D1 D2 / D3.", terms=_FLOW, mean_size=1.0),
-    row("flow_logarithm", "sigma(eps) [1 - n ln(D_e / 200 um)]", "Logarithmic in size.", source="ad hoc (this work)",
+    row("flow_logarithm", "sigma(eps) [1 - n ln(D_e / 200 um)]", "Logarithmic in size.", source=OWN,
         formula="logarithm", terms=_FLOW),
-    row("strain_gradient", "sigma(eps) sqrt[(1 + 2n 200 um / D_e) / (1 + 2n)]",
-        "Geometrically necessary dislocations, or any length of the material's own.", formula="gradient", terms=_FLOW),
+    row("strain_gradient", "sigma(eps) sqrt[(1 + l / D_e) / (1 + l / 200 um)]",
+        "Geometrically necessary dislocations, or any length of the material's own.", formula="gradient", terms=_FLOW,
+        parameter="length_um", unit="um", sign=1, plausible=(20.0, 600.0)),
     formula="power", parameter="size_exponent", sign=0, plausible=(0.05, 1.5), needs=(Need.SEVERAL_SIZES,),
     source="Nix and Gao (1998), J. Mech. Phys. Solids 46, 411; Cooper et al. (2020), Powder Technol. 374, 10",
     equivalences=("rate_dependence, at one force rate",),
@@ -123,16 +129,39 @@ SHAPE = family(SecondOrderShape, "shape_second_order",
 )  # fmt: skip
 
 
+def _water(humidity_percent: Any) -> Any:
+    """Water over dry mass at a relative humidity [%], isotherm of Guggenheim, Anderson and de Boer."""
+    x = WATER[2] * humidity_percent / 100
+    return WATER[0] * WATER[1] * x / ((1 - x) * (1 - x + WATER[1] * x))
+
+
+def _glass(humidity_percent: Any) -> Any:
+    """Glass transition of cellulose with the water it takes up [K], after Gordon and Taylor."""
+    water = GORDON_TAYLOR * _water(humidity_percent)
+    return (GLASS_K[0] + water * GLASS_K[1]) / (1 + water)
+
+
+def _sigmoid(e: Humidity, humidity_percent: Any) -> Any:
+    return jax.nn.sigmoid((humidity_percent - e.middle_percent) / SIGMOID_WIDTH)
+
+
 class Humidity(Strength):
     """Water softens the particle; with a `modulus_share` the modulus at so many times the rate of C1."""
 
     modulus_share: Any = None
     threshold_percent: Any = None
+    middle_percent: Any = None
 
     formulas: ClassVar = {
         "exponential": lambda e, _, r: jnp.exp(-e.amplitude * (r.relative_humidity - REFERENCE_HUMIDITY_PERCENT)),
         "linear": lambda e, _, r: 1 - e.amplitude * (r.relative_humidity - REFERENCE_HUMIDITY_PERCENT),
         "threshold": lambda e, _, r: jnp.exp(-e.amplitude * positive(r.relative_humidity - e.threshold_percent)),
+        "glass_transition": lambda e, _, r: jnp.exp(
+            e.amplitude * (_glass(r.relative_humidity) - _glass(REFERENCE_HUMIDITY_PERCENT))
+        ),
+        "sigmoid": lambda e, _, r: (
+            1 - e.amplitude * (_sigmoid(e, r.relative_humidity) - _sigmoid(e, REFERENCE_HUMIDITY_PERCENT))
+        ),
     }
 
     def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
@@ -156,6 +185,16 @@ HUMIDITY = family(Humidity, "humidity",
         "Nothing happens until about 5 % of water is taken up.",
         Nuisance("threshold_percent", (40.0, 60.0), (5.0, 90.0), "humidity where it begins"), formula="threshold",
         terms=_FLOW),
+    row("flow_glass_transition", "sigma(eps) exp(k (T_g(RH) - T_g(45)))",
+        "Water lowers the glass transition of the amorphous part; strength follows the distance to it.",
+        source="Gordon and Taylor (1952), J. Appl. Chem. 2, 493; Simha and Boyer (1962), J. Chem. Phys. 37, 1003; "
+               "isotherm of about 5 % at 50 % (this work)", formula="glass_transition", terms=_FLOW,
+        parameter="softening_per_kelvin", unit="1/K", plausible=(2e-4, 1e-2)),
+    row("flow_sigmoid", "sigma(eps) [1 - k (S(RH) - S(45))], S = 1 / (1 + exp((RH_m - RH) / 8))",
+        "Strength falls from one level to another around a humidity.",
+        Nuisance("middle_percent", (45.0, 60.0, 75.0), (10.0, 95.0), "humidity half way"),
+        source="Peleg (1994), J. Texture Stud. 25, 403", formula="sigmoid", terms=_FLOW, parameter="softened_share",
+        unit="-", plausible=(0.02, 0.9)),
     formula="exponential", parameter="softening_per_percent_humidity", unit="1/%", plausible=(5e-4, 2e-2),
     source="Amidon and Houghton (1995), Pharm. Res. 12, 923", needs=(Need.HUMIDITY_COLUMN,),
     check="test in a chamber at 10, 40 and 75 % relative humidity", coordinates=("humidity", "peak"),

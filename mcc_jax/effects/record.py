@@ -214,7 +214,7 @@ class Context(eqx.Module):
 
     @property
     def peak_contact_radius(self) -> Values:
-        """Radius of contact at the peak [um], D_e sqrt(c^2 eps_P), c^2 = 1.43 (Storakers, perfect plasticity)."""
+        """Radius of contact at the peak [um], see `contact_radius`."""
         return contact_radius(self.particle, self.peak_strain)
 
     @property
@@ -253,5 +253,8 @@ def contact_of(recovered_share: Values) -> Values:
 
 
 def contact_radius(particle: Particle, strain: Values) -> Values:
-    """Radius of plastic contact [um] at a strain [-], 2 R_e sqrt(c^2 eps)."""
-    return particle.effective_diameter * root(PUNCH_AREA * strain)
+    """Radius of plastic contact with each of two platens [um] at a strain [-], D_e sqrt(c^2 eps / 2), c^2 = 1.43.
+
+    Each platen takes half of the displacement: a^2 = 2 c^2 R_e gamma / 2 (Storakers, Biwa and Larsson 1997).
+    """
+    return particle.effective_diameter * root(PUNCH_AREA * strain / 2)

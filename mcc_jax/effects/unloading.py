@@ -12,7 +12,7 @@ from .._types import Values
 from ..formulas import PUNCH_AREA, recovery, stress_ratio
 from .creep_and_cycles import NORM
 from .effect import AbstractEffect, pick
-from .record import RELOAD, Context, contact_of, positive, power, reload_progress
+from .record import RELOAD, Context, contact_of, positive, power, reload_progress, root
 from .variant import Need, Nuisance, family, row
 
 BISECTIONS = 50
@@ -81,13 +81,15 @@ class Adhesion(AbstractEffect):
     r"""Attraction over the contact while the particle is unloaded; it vanishes at the onset and with the contact.
 
     The law's branch carries what the instrument measures plus the attraction, :math:`u' = u + \kappa g(s(u'))`, with
-    :math:`\kappa = 4 c^2 \epsilon_P s_{ad} / \sigma_P`, the stress over the contact's area at the peak, or
-    :math:`\kappa = s_{ad} / \sigma_P` if it is counted `over_section` as all stresses of the law are. Of its solutions
-    the largest is stable. Derivatives follow from the implicit-function rule. A formula is g, attraction over its
-    strength at the recovered share s.
+    :math:`\kappa = 2 c^2 \epsilon_P s_{ad} / \sigma_P`, the stress over the contact's area at the peak, or
+    :math:`\kappa = s_{ad} / \sigma_P` if it is counted `over_section` as all stresses of the law are, or
+    :math:`\kappa = 2 \sqrt{\pi} a_P^{3/2} K_c / (\pi R_e^2 \sigma_P)` for a toughness of the contact's `edge`. Of its
+    solutions the largest is stable. Derivatives follow from the implicit-function rule. A formula is g, attraction
+    over its strength at the recovered share s.
     """
 
     over_section: float = 0.0
+    edge: float = 0.0
     mobilised_share: Any = None
 
     formulas: ClassVar = {
@@ -101,7 +103,10 @@ class Adhesion(AbstractEffect):
     def inside(self, context: Context) -> Values:
         share = context.load_share
         carries = context.peak_stress > 1e-6
-        share_of_section = pick(self.over_section, 1.0, 4 * PUNCH_AREA * context.peak_strain)
+        share_of_section = pick(self.over_section, 1.0, 2 * PUNCH_AREA * context.peak_strain)
+        radius = context.peak_contact_radius
+        crack = 2 * jnp.sqrt(jnp.pi) * radius * root(radius) / context.particle.effective_area
+        share_of_section = pick(self.edge, crack, share_of_section)
         area = share_of_section / jnp.where(carries, context.peak_stress, 1.0)
         strength = self.amplitude * jnp.where(carries, area, 0.0)
         frozen, fixed = jax.lax.stop_gradient(share), jax.lax.stop_gradient(strength)
@@ -125,7 +130,7 @@ class Adhesion(AbstractEffect):
 
 
 _SECTION = "phi = a/a_P, u' = u + s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
-_GENERAL = "phi = a/a_P, u' = u + 4 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
+_GENERAL = "phi = a/a_P, u' = u + 2 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
 _COHESIVE = "Needleman (1987), J. Appl. Mech. 54, 525; Olsson and Larsson (2013)"
 _MOBILISED = Nuisance("mobilised_share", (0.25, 0.4, 0.6), (0.05, 1.0), "recovered share at which half of it pulls")
 
@@ -138,6 +143,10 @@ ADHESION = family(Adhesion, "adhesion",
     row("jkr", f"g = phi^1.5 s; {_GENERAL}",
         "The same with the stress of the contact itself: larger contacts stick more strongly.",
         source="Johnson, Kendall and Roberts (1971)"),
+    row("kendall", "phi = a/a_P, u' = u + 2 sqrt(pi) a_P^1.5 K_c / F_P phi^1.5 s, d = Delta [s(u) - s(u')]",
+        "A rigid flat punch that peels off from its edge: K_c = sqrt(2 E* w) with the work of adhesion w.",
+        source="Kendall (1971), J. Phys. D 4, 1186; Maugis and Barquins (1978), J. Phys. D 11, 1989", formula="jkr",
+        edge=1.0, parameter="toughness_MPa_sqrt_um", unit="MPa um^0.5", plausible=(0.2, 20.0)),
     row("bond", f"g = phi^2 s; {_GENERAL}", "Bonds over the area of contact that is left.",
         source="Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
     row("stretched_tail", f"g = phi^1.5 s^4; {_GENERAL}",

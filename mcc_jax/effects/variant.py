@@ -194,6 +194,9 @@ class Mechanism:
         return variants[name]
 
 
+OWN = "this work"  # source of a formula that no publication gives
+
+
 def row(name: str, equation: str, explanation: str, *nuisances: Nuisance, **own: Any) -> dict[str, Any]:
     """One formula of a `family`, with what differs from the others: fields of `Variant`, settings of the class.
 
@@ -209,11 +212,11 @@ def family(
     """A mechanism from its rows.
 
     `make` is the class of the effects unless a row names another. `common` has further fields of the mechanism and
-    those of `Variant` that rows do not give; without a unit, of positive sign and our own unless stated.
+    those of `Variant` that rows do not give; without a unit, of positive sign and of this work unless stated.
     """
     of_mechanism = {f.name: common.pop(f.name) for f in fields(Mechanism) if f.name in common}
     known, variants = {f.name for f in fields(Variant)}, []
-    defaults = {"mechanism": name, "make": make, "unit": "-", "sign": 1, "source": "ad hoc (this work)"}
+    defaults = {"mechanism": name, "make": make, "unit": "-", "sign": 1, "source": OWN}
     for own in rows:
         given = {**defaults, **common, **own}
         fixed = {key: given.pop(key) for key in list(given) if key not in known}

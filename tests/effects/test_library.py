@@ -18,7 +18,8 @@ CONTRACT = [
     "reverse_plasticity", "humidity",
 ]  # fmt: skip
 UNITS = {"um/mN": "_um_per_mN", "um/s": "_um_per_s", "1/MPa": "_per_MPa", "1/GPa": "_per_GPa", "MPa": "_MPa"}
-UNITS |= {"um": "_um", "rad": "_rad", "1/%": "_per_percent_humidity"}
+UNITS |= {"um": "_um", "rad": "_rad", "1/%": "_per_percent_humidity", "1/K": "_per_kelvin"}
+UNITS |= {"MPa um^0.5": "_MPa_sqrt_um"}
 NUISANCE_UNITS = ("_s", "_MPa", "_mN", "_um", "_rad", "_percent", "_strain", "_share", "exponent", "cycles_to_rest")
 
 

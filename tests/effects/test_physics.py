@@ -123,6 +123,14 @@ def test_creep_of_a_slow_ramp_is_the_closed_form():
             np.testing.assert_allclose(crept / scale, value, rtol=2e-3)
 
 
+def test_creep_under_a_round_contact_is_that_of_lee_and_radok():
+    """After a step of load d^(3/2) = d_0^(3/2) (1 + c (1 - exp(-t / tau)))."""
+    record = ramp_and_hold()
+    crept = added(LIBRARY["creep"]["growing_contact"], 0.1, record, tau_s=40.0)[1:]
+    first, time = float(base(record)[1]), np.asarray(record.time)[1:]
+    np.testing.assert_allclose((1 + crept / first) ** 1.5, 1 - 0.1 * np.expm1(-time / 40.0), rtol=1e-4)
+
+
 def test_creep_of_a_hold_needs_a_hold_and_begins_again_with_each():
     """Nothing on ramps; two holds of ten seconds make twice what one makes, not what one of twenty makes."""
     time = filled(np.linspace(0.0, 60.0, 61))
@@ -178,6 +186,20 @@ def test_a_constant_pull_depends_on_what_the_load_has_lost():
     assert (np.diff(pull[:35]) > 0).all()
 
 
+def test_a_flat_contact_pulls_off_at_kendalls_force():
+    """The strength of the pull over the peak force is sqrt(8 pi a^3 E* w) / F_P, with K_c = sqrt(2 E* w)."""
+    modulus, work = 5000.0, 0.01  # MPa, N/m
+    record = clean_record(filled(np.array([0.0, 200.0, 100.0])), filled(np.array([0.0, 100.0, 150.0])))
+    toughness = np.sqrt(2 * modulus * work)
+    pulled = added(LIBRARY["adhesion"]["kendall"], toughness, record)[2]
+    peak = float(base(record)[1])
+    radius = np.sqrt(1.43 * float(PARTICLE.effective_diameter) * peak / 2)
+    pull_off = 1e-3 * np.sqrt(8 * np.pi * radius**3 * modulus * work)  # mN
+    equal = added(LIBRARY["adhesion"]["jkr_nominal"], 1e3 * pull_off / float(PARTICLE.effective_area), record)[2]
+    assert pulled == pytest.approx(equal, rel=1e-3)  # the root of a small radius is rounded
+    assert 1 < pull_off < 100
+
+
 @pytest.mark.extended
 @family("adhesion")
 def test_adhesion_holds_the_particle_back(variant):
@@ -220,6 +242,24 @@ def test_the_hysteresis_loop_dissipates():
         np.testing.assert_allclose(displacement[3 * part], displacement[part], rtol=1e-12)
         again = displacement[3 * part : 5 * part + 1]
         np.testing.assert_allclose(displacement[loop], again, rtol=1e-9)
+
+
+def test_an_inner_loop_closes_and_is_forgotten():
+    """The lag of plays is h Delta half way from full release, and what was reloaded and released leaves no trace."""
+    variant = LIBRARY["reload_hysteresis"]["return_point"]
+    outer = np.array([0.0, 200.0, 0.0, 100.0, 200.0])
+    inner = np.array([0.0, 200.0, 0.0, 100.0, 60.0, 100.0, 200.0])
+    lags = [
+        added(variant, 0.2, clean_record(filled(force), filled(10.0 * np.arange(len(force)))))
+        for force in (outer, inner)
+    ]
+    strain = LAW.plastic.strain(PARTICLE.stress(jnp.asarray(200.0))) / LAW.shape_factor(PARTICLE)
+    peak = PARTICLE.displacement(strain)
+    delta = float(LAW.recoverable_displacement(PARTICLE, peak, jnp.asarray(200.0), jnp.asarray(1.0)))
+    assert lags[0][3] == pytest.approx(-0.2 * delta, rel=1e-9)
+    np.testing.assert_allclose(lags[1][[3, 5, 6]], lags[0][[3, 3, 4]], atol=1e-12)
+    assert lags[1][4] > lags[1][3]  # the inner loop has a width of its own
+    assert abs(lags[0][4]) < 1e-12
 
 
 def test_ratcheting_counts_reloads():
@@ -280,12 +320,32 @@ def test_shape_is_the_shape_factor():
     np.testing.assert_allclose(respond(variant, b), law.path_load(PARTICLE, law.init(PARTICLE), FORCE)[1], rtol=1e-9)
 
 
+def test_a_length_of_the_material_is_that_of_nix_and_gao():
+    """Strength^2 is linear in 1 / D_e, with the ratio of slope to intercept the length."""
+    effect = LIBRARY["size_effect"]["strain_gradient"].build(50.0)
+    small, large = (float(effect.modify(LAW, sphere(d), RECORD).plastic.C1) for d in (50.0, 1e6))
+    assert (small / large) ** 2 == pytest.approx((1 + 50 / 50) / (1 + 50 / 1e6), rel=1e-9)
+
+
 def test_a_pop_in_is_a_step_that_stays():
     variant = LIBRARY["pop_in"]["sharp"]
     jump = added(variant, 0.7, location_MPa=2.0)
     stress = np.maximum.accumulate(np.asarray(PARTICLE.stress(FORCE)))
     np.testing.assert_allclose(jump[stress < 1.97], 0, atol=1e-12)
     np.testing.assert_allclose(jump[stress > 2.03], 0.7, atol=1e-12)
+
+
+def test_an_elastic_onset_is_hertz_up_to_yield_and_the_law_beyond():
+    """F ~ d^(3/2) below the stress of yield; there the slope is that of a linear law, and stays."""
+    law = MccLaw(Plastic(6.0, 0.0, 1e-9), 0.0, 16_000.0)
+    yields, effect = 4.0, LIBRARY["toe_asperity"]["hertz"]
+    toe = 0.5 * yields / 6.0  # strain
+    stress = np.linspace(0.0, 12.0, POINTS)
+    record = clean_record(PARTICLE.force(jnp.asarray(stress)), jnp.linspace(0.0, 100.0, POINTS))
+    strain = np.asarray(PARTICLE.strain(respond(effect, toe, law=law, record=record, stress_scale_MPa=yields)))
+    elastic = stress <= yields
+    np.testing.assert_allclose(strain[elastic], 1.5 * yields / 6.0 * (stress[elastic] / yields) ** (2 / 3), atol=1e-4)
+    np.testing.assert_allclose(strain[~elastic], stress[~elastic] / 6.0 + toe, rtol=1e-6)
 
 
 def test_asperities_stay_flat():
@@ -337,6 +397,24 @@ def test_dry_air_hardens_and_an_unknown_humidity_does_nothing():
     assert clean_record(FORCE, TIME).relative_humidity == 45
 
 
+def test_strength_follows_the_glass_transition_and_a_sigmoid():
+    """Water of an isotherm lowers T_g by Gordon and Taylor; a sigmoid is half way at its middle."""
+
+    def strength(name, amplitude, humidity, **further):
+        record = eqx.tree_at(lambda r: r.relative_humidity, RECORD, jnp.asarray(humidity))
+        law = LIBRARY["humidity"][name].build(amplitude, **further).modify(LAW, PARTICLE, record)
+        return float(law.plastic.C1 / LAW.plastic.C1)
+
+    water = {rh: 0.036 * 12 * 0.75 * rh / ((1 - 0.75 * rh) * (1 - 0.75 * rh + 9 * rh)) for rh in (0.45, 0.8)}
+    assert water[0.45] == pytest.approx(0.047, abs=1e-3)
+    k = 1.55 * 493 / 136
+    glass = {rh: (493 + k * w * 136) / (1 + k * w) for rh, w in water.items()}
+    assert strength("flow_glass_transition", 0.01, 80.0) == pytest.approx(np.exp(0.01 * (glass[0.8] - glass[0.45])))
+    assert strength("flow_sigmoid", 0.5, 45.0, middle_percent=60.0) == pytest.approx(1.0)
+    dry, half, wet = (strength("flow_sigmoid", 0.5, rh, middle_percent=60.0) for rh in (0.0, 60.0, 100.0))
+    assert half == pytest.approx((dry + wet) / 2, abs=2e-3)
+
+
 def test_water_softens_yield_and_modulus_at_two_rates():
     both = LIBRARY["humidity"]["C1_and_modulus"].build(0.01, modulus_share=0.5)
     wet = eqx.tree_at(lambda r: r.relative_humidity, RECORD, jnp.asarray(65.0))
@@ -354,7 +432,7 @@ def test_a_stiff_platen_does_not_give_way():
     variant = LIBRARY["platen_sink_in"]["flat"]
     top = at(240.0)
     strain = float(BASE[top] / PARTICLE.effective_diameter)
-    radius = 2 * float(PARTICLE.effective_radius) * np.sqrt(1.43 * strain)
+    radius = 2 * float(PARTICLE.effective_radius) * np.sqrt(1.43 * strain / 2)  # each platen takes half
     assert added(variant, 0.1)[top] == pytest.approx(0.1 * 300.0 / (2 * radius), rel=2e-3)
 
 
