@@ -16,7 +16,7 @@ from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need, Record
 from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
 from .adjustment import campaign_segments
 from .schema import Campaign, Curve
-from .segments import Segment
+from .segments import BAND, Segment
 from .signal import Line
 
 JUMP = 1.3  # factor by which rates of force differ at least; less is what the control of test machines leaves
@@ -117,7 +117,8 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
 
     Changes of speed are kinks, believed where straight lines that meet describe the force better than one line and than
     any polynomial of as many numbers, by the Bayesian information criterion (Schwarz 1978; a kink counts as three
-    numbers, Zhang and Siegmund 2007). A ramp without duration keeps the rate `before` it.
+    numbers, Zhang and Siegmund 2007). A ramp without duration, and a piece
+    of one that does not move, keep the rate `before` them.
     """
     if len(time) < 2 or np.ptp(time) <= 0:
         return np.full(len(time), before)
@@ -125,7 +126,11 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
     rates = np.empty(len(time))
     for first, last in itertools.pairwise(ends):
         piece = slice(first, last + 1)
-        rates[first + (first > 0) : last + 1] = abs(Line.through(time[piece], force[piece]).slope)
+        slope = abs(Line.through(time[piece], force[piece]).slope)
+        # A hold too short to be a segment is a piece that does not move; it belongs to the ramp before it.
+        if slope * (time[last] - time[first]) >= BAND * np.ptp(force):
+            before = slope
+        rates[first + (first > 0) : last + 1] = before
     return rates
 
 

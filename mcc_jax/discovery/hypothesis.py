@@ -101,12 +101,12 @@ def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, 
     # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
     seen = list(visible(r.optimum.hyper, r.design, curves))
     if one.own is not None:
-        more = one.own.more
-        if not one.own.jumps:
-            curve = one.own.curve_um
-            misfits.append(columns_of(one.own.variant, curve))
-            alone = replace(r.design, own=r.design.own[..., :5], spreads=r.design.spreads[:4])
-            seen.extend(visible(r.optimum.hyper[:HYPERPARAMETERS], alone, curve[..., None]))
+        more, curve = one.own.more, one.own.curve_um
+        alone = replace(r.design, own=r.design.own[..., :5], spreads=r.design.spreads[:4])
+        seen.extend(visible(r.optimum.hyper[:HYPERPARAMETERS], alone, curve[..., None]))
+        if one.own.jumps:  # steps too small to be found add up to a curve that all tests share
+            curve = np.full_like(curve, np.mean(np.max(curve, 1)))
+        misfits.append(columns_of(one.own.variant, curve))
     more = replace(
         more,
         own=(*more.own, curves),  # amplitudes differ from particle to particle

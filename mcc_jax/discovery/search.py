@@ -221,7 +221,15 @@ class Search:
             further = {n: partial(own.next_to, *start, *self.start_of([k]), self.small) for n, k in seconds.items()}
         for names, one in zip(further, side_by_side(call, list(further.values())), strict=True):
             self.keep(names, one)
+            self.without_name(names, one)
         self.fit_misfits([*pairs, *further], leader)
+
+    def without_name(self, pair: Names, own: RandomEffects | None) -> None:
+        """Numbers of every test's own that were found next to a name, without it: the search for them may end early."""
+        (mechanism,) = (m for m in pair if m in self.not_shared)
+        if own is not None and own.log_evidence > self.found[mechanism,].alone:
+            self.keep((mechanism,), own.next_to(self.base, self.null.state, (), (), self.small))
+            self.fit_misfit(self.found[mechanism,])
 
     def row_of(self, r: Fitted) -> tuple[int, ...]:
         """The candidates that were fitted together."""
@@ -305,7 +313,7 @@ class Search:
         for m, one in zip(self.not_shared, ones, strict=True):
             self.keep((m,), one)
         alone = [self.found[m,] for m in self.not_shared]
-        side_by_side(self.fit_misfit, [x for x in alone if x.own is not None and not x.own.jumps])
+        side_by_side(self.fit_misfit, [x for x in alone if x.own is not None])
         leaders = [x for x in self.found.values() if x.names and x.own is None and x.at is not None]
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.log_evidence, at=smooth)
         most = max(x.log_evidence for x in self.found.values())

@@ -343,5 +343,6 @@ POP_IN = family(PopIn, "pop_in",
     nuisances=(Nuisance("location_MPa", (1.0, 2.0, 4.0, 7.0), (0.3, 16.0), "stress at which it breaks",
                         random_per_test=True),),
     equivalences=("the law's own snap-through, where a loading curve is not monotone",),
-    check="watch the particle from the side, or listen to it, while the step occurs", coordinates=(), sudden=True,
+    check="watch the particle from the side, or listen to it, while the step occurs", coordinates=("peak",),
+    sudden=True,
 )  # fmt: skip

@@ -112,13 +112,18 @@ def context_along(
 def peak_displacement(particle: Particle, record: Record, highest: Path, strain: Path, before: Scalar) -> Path:
     """Largest displacement so far [um], from that before and the strain of virgin loading at every point's force.
 
-    Where the record knows its peaks, the branches that follow carry the latest value on virgin loading.
+    Where the record knows its peaks, the branches that follow carry the latest value on virgin loading: the largest one
+    would be too large by its noise.
     """
-    on_loading = jnp.where(record.force >= highest, particle.displacement(strain), 0.0)
+    virgin = record.force >= highest
+    on_loading = jnp.where(virgin, particle.displacement(strain), 0.0)
     if record.peak is None:
         new = running_max(on_loading)
     else:
         new = forward_fill(on_loading, (record.force >= record.peak).at[0].set(True))
+        # On a faster ramp the loading curve begins below the peak from which it goes on: the peak stays until then.
+        ended = running_max(jnp.where(virgin, 0.0, new))
+        new = jnp.where(new > ended, new, ended)
     return jnp.where(new > before, new, before)
 
 

@@ -12,7 +12,7 @@ from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, signature_rows
 from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, paper_campaign
 from mcc_jax.campaign import available_data, find_segments, humidities, record_of
 from mcc_jax.campaign.record import ramp_rates
-from mcc_jax.effects import Need, clean_record
+from mcc_jax.effects import LIBRARY, Need, clean_record
 
 STEPS = (Ramp(0.6, 2.0), Ramp(0.2, 4.0), Ramp(1.0, 1.0), Hold(40.0), Ramp(0.3, 2.0), Ramp(0.9, 2.0), Ramp(0.0, 2.0))
 
@@ -85,6 +85,24 @@ def test_a_kink_has_two_rates_and_a_bend_has_one(jump, place, noise, readings, s
     np.testing.assert_allclose(found, [slope, jump * slope], rtol=0.1)
     for smooth in (time, time**1.5, time**2, np.expm1(time / 5), 1 - np.exp(-time / 4)):
         assert len(set(ramp_rates(time, smooth / smooth[-1] + scatter, 0.0))) == 1
+
+
+def test_a_hold_too_short_to_be_one_leaves_the_rate_of_its_ramp():
+    time = np.arange(14.0)
+    force = np.minimum(2.0 * time, 22.0)
+    np.testing.assert_allclose(ramp_rates(time, force, 7.0), 2.0, rtol=0.05)
+
+
+def test_a_faster_ramp_leaves_the_peak_where_it_is():
+    """At a higher rate the loading curve begins below the peak before: nothing comes back until it is met again."""
+    steps = (Ramp(0.6, 1.0), Hold(30.0), Ramp(0.3, 1.0), Ramp(1.0, 8.0), Ramp(0.0, 8.0))
+    measured = campaign(steps=steps)
+    curve = measured.curves[0]
+    law = LAW.with_effects(LIBRARY["rate_dependence"]["flow_log_force_rate"].build(0.05))
+    record = record_of(curve, find_segments(curve))
+    clean = clean_record(jnp.asarray(curve.force_mN), jnp.asarray(curve.time_s))
+    of_record, of_path = (np.asarray(law.respond(PARTICLE, one)) for one in (record, clean))
+    np.testing.assert_allclose(of_record, of_path, atol=2e-2)
 
 
 def test_rates_of_very_short_ramps():
