@@ -11,7 +11,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,7 +26,15 @@ import mcc_jax as mcc
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign, particle_batch
 from mcc_jax.effects import AbstractEffect, Nuisance, Variant
 from mcc_jax.effects.record import UNLOAD
-from mcc_jax.simulate import HiddenEffect, Instrument, Programme, law_for_each, paper_population, simulate_campaign
+from mcc_jax.simulate import (
+    HiddenEffect,
+    Instrument,
+    Programme,
+    Ramp,
+    law_for_each,
+    paper_population,
+    simulate_campaign,
+)
 from mcc_jax.simulate.campaign import PAPER_PEAK_STRESS_MPA
 
 RESULTS = Path(__file__).parent / "results" / "kinds"
@@ -40,7 +48,9 @@ class Inside(AbstractEffect):
     seed: Any = None
 
     formulas: ClassVar = {
-        "root_toe": lambda e, c: c.particle.displacement(-jnp.expm1(-jnp.sqrt(c.peak_stress / 0.3 + 1e-9))),
+        "two_heights": lambda e, c: c.particle.displacement(
+            1 - (jnp.exp(-c.peak_stress / 0.2) + jnp.exp(-c.peak_stress / 1.5)) / 2
+        ),
         "ripple": lambda e, c: c.particle.displacement(jnp.sin(2 * jnp.pi * c.peak_strain / 0.05)),
         "seating": lambda e, c: c.particle.displacement(jax.nn.sigmoid((c.peak_stress - 4.0) / 0.2)),
         "bump": lambda e, c: (
@@ -164,14 +174,14 @@ def _steps(names: str) -> list[Case]:
 
 
 def _rate(formula: str, size: float, two: bool, terms: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Case:
-    return Case((hidden("rate_dependence", Flow, formula, size, terms=terms),), rates=(0.5, 8.0) if two else (2.0,))
+    return Case((hidden("rate_dependence", Flow, formula, size, terms=terms),), rates=(1.0, 4.0) if two else (2.0,))
 
 
 def _one(mechanism: str, make: type[AbstractEffect], formula: str, size: float, **more: Any) -> Case:
     return Case((hidden(mechanism, make, formula, size),), **more)
 
 
-FRAME, TOE = ("frame_compliance", Observed, "power_frame"), ("toe_asperity", Inside, "root_toe")
+FRAME, TOE = ("frame_compliance", Observed, "power_frame"), ("toe_asperity", Inside, "two_heights")
 FRICTION, DAMAGE = ("platen_friction", Flow, "slender"), ("damage", Stiffness, "power_damage")
 SIZE, TILT = ("size_effect", Flow, "hall_petch"), ("misalignment", Observed, "wedge")
 
@@ -232,7 +242,7 @@ def cases_of(kind: str, number: int) -> list[tuple[Case, int]]:
 
 
 def campaign_of(case: Case, seed: int) -> Campaign:
-    """Twelve particles, two cycles with holds; of two rates half of the particles each."""
+    """Twelve particles, two cycles with holds; of two rates the second from the first reload on."""
     rng, count = np.random.default_rng([seed, 64]), 12
     diameters = PAPER_DIAMETERS_UM[rng.permutation(20)[:count]]
     plastic = paper_population().sample(jax.random.key(seed), 4 * count)
@@ -241,25 +251,23 @@ def campaign_of(case: Case, seed: int) -> Campaign:
     stress = jnp.asarray(rng.uniform(*PAPER_PEAK_STRESS_MPA, count))
     peaks = np.asarray(eqx.filter_vmap(mcc.Particle.force)(particle_batch(diameters), stress))
     humidity = rng.uniform(15, 80, count) if case.humid else None
-    parts = []
-    for k, rate in enumerate(case.rates):
-        rows = np.arange(k, count, len(case.rates))
-        laws = law_for_each(jax.tree.map(lambda leaf, rows=rows: leaf[rows], plastic), 1.43, case.form[1], case.form[0])
-        programme = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=30.0, points=150, rate=rate)
-        parts.append(simulate_campaign(
-            laws, diameters[rows], peaks[rows], programme, instrument=INSTRUMENT, effects=case.effects, seed=seed + k,
-            particles=[str(row + 1) for row in rows],
-            relative_humidity_percent=None if humidity is None else humidity[rows],
-        ))  # fmt: skip
-    names, curves = [n for p in parts for n in p.particles], [c for p in parts for c in p.curves]
-    columns = {key: tuple(v for p in parts for v in p.columns[key]) for key in parts[0].columns}
-    return Campaign(
-        tuple(names), np.concatenate([p.diameters_um for p in parts]), tuple(curves), columns, parts[0].metadata
+    programme = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=30.0, points=150, rate=case.rates[0])
+    down = next(k for k, step in enumerate(programme.steps) if isinstance(step, Ramp) and step.to == 0.3)
+    later = [replace(s, rate=case.rates[-1]) if isinstance(s, Ramp) else s for s in programme.steps[down + 1 :]]
+    return simulate_campaign(
+        law_for_each(plastic, 1.43, case.form[1], case.form[0]),
+        diameters,
+        peaks,
+        replace(programme, steps=(*programme.steps[: down + 1], *later)),
+        instrument=INSTRUMENT,
+        effects=case.effects,
+        seed=seed,
+        relative_humidity_percent=humidity,
     )
 
 
 def is_right(case: Case, found: Mapping[str, Any]) -> bool:
-    """Whether an answer has all that is hidden, by name, and nothing else."""
+    """Whether an answer has all that is hidden, each first in its set, and nothing else, as in the sealed bench."""
     names = {effect.variant.mechanism for effect in case.effects}
     form = "printed" if case.form[0] == "printed" else "punch"
     if found["form"] != form:
@@ -271,7 +279,7 @@ def is_right(case: Case, found: Mapping[str, Any]) -> bool:
     sets = [set(s) for s in found["sets"]]
     if names == {"rate_dependence"} and len(case.rates) == 1 and len(sets) == 1:  # at one rate size looks the same
         return names <= sets[0] <= names | {"size_effect"}
-    return len(sets) == len(names) and all(len(s) == 1 for s in sets) and set().union(*sets) == names
+    return len(sets) == len(names) and {s[0] for s in found["sets"]} == names
 
 
 def main() -> None:
