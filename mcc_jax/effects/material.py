@@ -19,10 +19,10 @@ from .variant import OWN, Need, Nuisance, family, row
 REFERENCE_DIAMETER_UM = 200.0
 REFERENCE_STRESS_MPA = 10.0
 LOCKING_STRAIN = 0.5
-WATER = 0.036, 12.0, 0.75  # isotherm of microcrystalline cellulose: monolayer [-], strength of binding, multilayers
-GLASS_K = 493.0, 136.0  # glass transitions of dry cellulose and of water [K]
+WATER = 0.036, 12.0, 0.75  # isotherm of microcrystalline cellulose: monolayer [-], binding, multilayers (this work)
+GLASS_K = 493.0, 136.0  # glass transitions of dry cellulose (assumed) and of water [K]
 GORDON_TAYLOR = 1.55 * 493.0 / (1.0 * 136.0)  # rho T_g of cellulose over that of water (rule of Simha and Boyer)
-SIGMOID_WIDTH = 8.0  # percent of relative humidity
+SIGMOID_WIDTH = 8.0  # percent of relative humidity (this work)
 
 
 def scaled(law: Formulas, first: Scalar, others: Scalar, modulus: Scalar) -> Formulas:

@@ -103,10 +103,10 @@ class Adhesion(AbstractEffect):
     def inside(self, context: Context) -> Values:
         share = context.load_share
         carries = context.peak_stress > 1e-6
-        share_of_section = pick(self.over_section, 1.0, 2 * PUNCH_AREA * context.peak_strain)
         radius = context.peak_contact_radius
         crack = 2 * jnp.sqrt(jnp.pi) * radius * root(radius) / context.particle.effective_area
-        share_of_section = pick(self.edge, crack, share_of_section)
+        in_contact = 2 * PUNCH_AREA * context.peak_strain
+        share_of_section = pick(self.edge, crack, pick(self.over_section, 1.0, in_contact))
         area = share_of_section / jnp.where(carries, context.peak_stress, 1.0)
         strength = self.amplitude * jnp.where(carries, area, 0.0)
         frozen, fixed = jax.lax.stop_gradient(share), jax.lax.stop_gradient(strength)
