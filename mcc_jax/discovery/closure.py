@@ -10,10 +10,11 @@ import numpy as np
 
 from .._format import described
 from .evidence import LinearModel
+from .periods import Periodogram
 from .search import Search
 from .settings import HYPERPARAMETERS, UNLISTED, WAVES
 
-POINTS = 60  # of the curve
+POINTS, PER_PERIOD = 60, 12  # of the curve, and of each period at least
 SHORTLIST = 24  # terms that are tried in pairs
 ONE_TERM = 0.9  # share of what two terms of a formula explain from which on one term will do
 
@@ -24,6 +25,7 @@ LETTERS = {  # coordinates of a formula: letter and meaning
     "load": ("u", "F / F_peak"),
     "clock": ("t", "time [s]"),
     "force": ("F", "force [mN]"),
+    "drive": ("d", "displacement [um]"),  # in what repeats alone
 }
 
 
@@ -78,6 +80,13 @@ def terms_of(letter: str, x: np.ndarray, low: float, high: float) -> dict[str, n
     return found
 
 
+def _sinusoids(letter: str, x: np.ndarray, one: Periodogram, size: np.ndarray) -> dict[str, np.ndarray]:
+    """Sinusoids of the likeliest period, as they are printed, and their values: errors in micrometres."""
+    period, angle = _rounded(1 / one.best, 4), 2 * np.pi * one.best * x
+    waves = {"sin": np.sin(angle), "cos": np.cos(angle)}
+    return {f"um / D_e {name}(2 pi {letter}/{period:g})": wave / size[:, None] for name, wave in waves.items()}
+
+
 def _rounded(x: float, digits: int = 2) -> float:
     return float(f"{x:.{digits}g}")
 
@@ -88,7 +97,11 @@ def closure(search: Search, seed: int) -> Closure:
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
     natural = {name: search.natural[name] for name in LETTERS if name in search.natural}
     span = {name: (float(x[mask].min()), float(x[mask].max())) for name, x in natural.items()}
-    every = {n: terms_of(LETTERS[n][0], x, *span[n]) for n, x in natural.items() if span[n][1] > span[n][0]}
+    moving = {n: x for n, x in natural.items() if span[n][1] > span[n][0]}
+    every = {n: terms_of(LETTERS[n][0], x, *span[n]) for n, x in moving.items() if n != "drive"}
+    periods = {one.coordinate: one for one in search.discrepancy.periods}
+    for n, one in periods.items():
+        every[n] = every.get(n, {}) | _sinusoids(LETTERS[n][0], moving[n], one, size)
     terms = [(name, text) for name, of_one in every.items() for text in of_one]
     values = np.stack([x * size[:, None] for of_one in every.values() for x in of_one.values()], -1)
     values = np.where(mask[..., None], values, 0.0)
@@ -107,10 +120,14 @@ def closure(search: Search, seed: int) -> Closure:
     meanings = dict.fromkeys(" = ".join(LETTERS[terms[k][0]]) for k in chosen)
     # Weights along the coordinate have the size that the smooth discrepancy was found to have, in units of strain.
     unit = float(np.sqrt(np.mean((curve / size[:, None])[mask] ** 2)))
-    basis = np.where(mask[..., None], _cosines(search.at[name]) * size[:, None, None], 0.0)
+    basis, x, one = _cosines(search.at[name]) * size[:, None, None], np.linspace(*span[name], POINTS), periods.get(name)
+    there = _cosines(np.linspace(0.0, 1.0, POINTS))
+    if one is not None and "2 pi" in terms[chosen[0]][1]:
+        x = np.linspace(*span[name], max(POINTS, int(PER_PERIOD * one.best * np.ptp(span[name]))))
+        basis, there = one.columns(natural[name]) * np.mean(size), one.columns(x)
+    basis = np.where(mask[..., None], basis, 0.0)
     shared = LinearModel(hyper, law.with_amplitudes(basis)).shared()
     covariance = np.linalg.inv(shared.information + np.eye(basis.shape[-1]) / max(unit, 1e-12) ** 2)
-    there = _cosines(np.linspace(0.0, 1.0, POINTS))
     # What the discrepancy adds to every test by the weights that the others make.
     smoothed = LinearModel(smooth.optimum.hyper, whole)
     others = np.array([smoothed.numbers(np.delete(everyone, i))[0][: len(fixed)][~fixed] for i in everyone])
@@ -118,7 +135,7 @@ def closure(search: Search, seed: int) -> Closure:
     return Closure(
         formula=f"added displacement / D_e = {' '.join(texts)}; {', '.join(meanings)}",
         coordinate=name,
-        x=np.linspace(*span[name], POINTS),
+        x=x,
         added=there @ (covariance @ shared.score),
         sd=np.sqrt(np.maximum(np.einsum("xk,kl,xl->x", there, covariance, there), 0.0)),
         selection_frequency=float(np.mean([terms[k][0] == name for k in again])),

@@ -17,6 +17,7 @@ from .base import Base, State
 from .design import NO_EXTRA, Design, ExtraColumns, Variants, design_of, linear_at
 from .evidence import LinearModel, likely_start, log_joint, optimise, visible, with_little_noise
 from .fit import Fitted, fit_hypothesis, moved
+from .periods import Periodogram
 from .screen import Candidates, single_integrals
 from .settings import DECISIONS, EARLY, HYPERPARAMETERS, UNLISTED, VERY_STRONG
 
@@ -136,10 +137,16 @@ def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, 
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """A smooth discrepancy common to all particles, which no mechanism explains."""
+    """A discrepancy common to all particles, smooth or periodic, which no mechanism explains."""
 
     parts: tuple[np.ndarray, ...]  # functions of each of its parts [um]
     log_white: float  # logarithm of the standard deviation of white noise, by which they are measured
+    periods: tuple[Periodogram, ...] = ()  # whose sinusoids are the last parts
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Standard deviations that a part may have where none is fitted [um]."""
+        return DECISIONS.general * np.exp(self.log_white) * np.array([0.1, 0.3, 1.0, 3.0])
 
     def added_to(self, base: Base, r: Fitted, at_least: float = -np.inf) -> Fitted | None:
         """The law, or what is named, with the discrepancy at its optimum; None where it begins far below `at_least`."""
@@ -160,7 +167,8 @@ class Discrepancy:
             optimum = optimise(there.design, optimum.hyper, without=r.optimum)
             if optimum.log_joint > at.optimum.log_joint:
                 at = replace(there, optimum=optimum)
-        return at
+        of_choices = sum(one.of_choice(self.sizes) for one in self.periods)
+        return replace(at, optimum=replace(at.optimum, log_evidence=at.optimum.log_evidence + of_choices))
 
     def curve_um(self, at: Fitted) -> np.ndarray:
         """What it adds to the law's displacement at every point, where it is part of a hypothesis [um]."""

@@ -18,7 +18,6 @@ from .settings import WAVES
 
 HATS, DEGREE = 8, 2  # hat functions of each coordinate of a misfit, and total degree of its smooth products
 SPLINES, FINE_SPLINES = 12, 24  # cosines of each coordinate of a discrepancy on no list, and of stress
-DRIVE_WAVES = 26  # periods over the range of micrometres, which is the widest among particles of several sizes
 
 
 @compiled_quickly
@@ -133,7 +132,7 @@ def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple
         *(splines(at[name], SPLINES) for name in ("strain", "travel", "load", *timed)),
         splines(at["load"], SPLINES) * at["reloading"][..., None],
         products.reshape(*products.shape[:-2], -1),
-        *(waves(at[name]) for name in ("travel", *timed)),
+        waves(at["travel"]),
     ]
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)
@@ -145,5 +144,4 @@ def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple
     for way in ("unloading", "reloading"):  # what a drive loses at a reversal, it loses at once
         turned = at[way][..., None]
         parts.append(np.concatenate([turned, splines(at["since"], HATS) * turned], -1))
-    parts.append(waves(at["drive"], DRIVE_WAVES))
     return tuple(np.where(mask[..., None], part, 0.0) for part in parts)

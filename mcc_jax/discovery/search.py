@@ -21,6 +21,7 @@ from .evidence import LinearModel, log_joint, with_little_noise
 from .fit import Fitted, at_priors, fit_hypothesis, noise_models, with_likely_noise, with_other_noise
 from .hypothesis import Discrepancy, Hypothesis, Names, RandomEffects, fit_with_misfit, random_amplitude, sudden_steps
 from .misfit import coordinates, functions, general, informative, misfit_columns, scaled
+from .periods import periodograms
 from .screen import Candidate, Screen, candidates_of, pair_integrals, screen, single_integrals, with_signatures
 from .settings import CONTENDERS, DECISIONS, STRONG, UNLISTED, VERY_STRONG
 
@@ -172,7 +173,9 @@ class Search:
     def discrepancy(self) -> Discrepancy:
         """Functions of what no mechanism explains."""
         parts = general(self.at, self.base.tests, self.null.design.linear)
-        return Discrepancy(parts, float(self.null.optimum.hyper[0]))
+        periods, mask = periodograms(self.natural, self.null), np.asarray(self.base.tests.mask)
+        repeating = [np.where(mask[..., None], one.columns(self.natural[one.coordinate]), 0.0) for one in periods]
+        return Discrepancy((*parts, *repeating), float(self.null.optimum.hyper[0]), periods)
 
     def fit_discrepancy(self, leader: Hypothesis, at_least: float) -> None:
         """Log evidence of a name with a smooth discrepancy in addition, where it comes near that of another."""

@@ -33,11 +33,11 @@ class _Statistic:
     def __init__(self, search: Search) -> None:
         design, formulas = search.null.design, search.screen.candidates
         self.library, self.signs, self.largest = len(search.library), formulas.signs, formulas.largest
-        self.unit = float(DECISIONS.general * np.exp(search.null.optimum.hyper[0]))
         names = [(c.mechanism, c.variant.name) for c in formulas.each]
         variants = {m: len({f for n, f in names if n == m}) for m, _ in names}
         self.weight = -np.log([variants[name[0]] * names.count(name) for name in names])
-        parts = search.discrepancy.parts
+        self.sizes, self.periods = search.discrepancy.sizes, search.discrepancy.periods
+        parts = search.discrepancy.parts[: len(search.discrepancy.parts) - len(self.periods)]
         self.parts = np.repeat(np.arange(len(parts)), [part.shape[-1] for part in parts])
         own = search.candidates.of({name: m for name, m in search.not_shared.items() if not m.sudden})
         self.own_names, self.own_ratio = own.mechanisms, own.largest
@@ -52,8 +52,8 @@ class _Statistic:
         # Of every particle; the population's come first.
         self.gram, self.score = model.particles.information, model.particles.score
 
-    def __call__(self, score: np.ndarray) -> np.ndarray:
-        """Log evidence ratios of campaigns, from scores of shape (campaigns, N, columns)."""
+    def __call__(self, score: np.ndarray, powers: Sequence[np.ndarray]) -> np.ndarray:
+        """Log evidence ratios of campaigns, from scores of shape (campaigns, N, columns) and periodograms."""
         _, formulas, _, own, steps = np.split(np.arange(score.shape[-1]), np.cumsum(self.counts)[:-1])
         gram, shared, f = self.gram, np.arange(sum(self.counts[:3])), len(formulas)
         whole, total = gram[:, shared[:, None], shared].sum(0), score[..., shared].sum(1)
@@ -65,11 +65,11 @@ class _Statistic:
         if f:
             each = single_integrals(s[:, :f], np.diagonal(G)[:f], self.signs, self.largest)
             logs.append(prior + np.asarray(logsumexp(each + self.weight, axis=1)))
-        smooth = []
+        smooth = [one.log_ratio(self.sizes, power) for one, power in zip(self.periods, powers, strict=True)]
         for part in np.unique(self.parts):  # at first order one part of the discrepancy at a time
             at = f + np.flatnonzero(self.parts == part)
             inside, scores = G[np.ix_(at, at)], s[:, at]
-            for size in self.unit * np.array([0.1, 0.3, 1.0, 3.0]):
+            for size in self.sizes:
                 spread = np.eye(len(at)) + size**2 * inside
                 value = 0.5 * size**2 * np.einsum("mk,km->m", scores, np.linalg.solve(spread, scores.T))
                 smooth.append(value - 0.5 * np.linalg.slogdet(spread)[1])
@@ -93,13 +93,16 @@ class _Statistic:
 
 def p_anything(search: Search, seed: int) -> float:
     """Probability that the base law alone would give as much evidence of anything missing, from scores drawn at its
-    fitted hyperparameters: normal, with the information as covariance."""
+    fitted hyperparameters: normal, with the information as covariance; powers of a periodogram are exponential."""
     statistic = _Statistic(search)
     values, vectors = np.linalg.eigh(statistic.gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-    normal = np.random.default_rng([seed, 41]).standard_normal((CAMPAIGNS, *statistic.score.shape))
-    drawn = statistic(np.einsum("ncd,mnd->mnc", root, normal, optimize=True))
-    return (1 + int(np.sum(drawn >= statistic(statistic.score[None])[0]))) / (1 + CAMPAIGNS)
+    rng, periods = np.random.default_rng([seed, 41]), statistic.periods
+    normal = rng.standard_normal((CAMPAIGNS, *statistic.score.shape))
+    powers = [rng.standard_exponential((CAMPAIGNS, len(one.power))) for one in periods]
+    drawn = statistic(np.einsum("ncd,mnd->mnc", root, normal, optimize=True), powers)
+    seen = statistic(statistic.score[None], [one.power[None] for one in periods])
+    return (1 + int(np.sum(drawn >= seen[0]))) / (1 + CAMPAIGNS)
 
 
 def _steps(base: Base, height: float, count: int) -> np.ndarray:
