@@ -211,9 +211,6 @@ def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
     return [{"quantity": name, "paper": value, **summary(named[name])} for name, value in paper.items()]
 
 
-# ---- ArviZ -----------------------------------------------------------------------------------------------------------
-
-
 def prior_draws(calibration: PosteriorDraws, count: int, seed: int) -> dict[str, np.ndarray]:
     """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
     flatness = np.asarray(calibration.fit.tests.flatness)

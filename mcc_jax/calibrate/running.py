@@ -78,8 +78,6 @@ def make_room() -> None:
         jax.clear_caches()
 
 
-# ---- blocks of particles ---------------------------------------------------------------------------------------------
-
 AXIS = "particles"  # the only axis of the mesh of a process's devices
 
 # Sizes of a campaign that is one block: those between are padded, so that few sizes are compiled. The last is the

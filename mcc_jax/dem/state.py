@@ -48,9 +48,6 @@ class Packing(eqx.Module):
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
-# ---- how it is made --------------------------------------------------------------------------------------------------
-
-
 def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing:
     """Spheres of given diameters [um] and density, pores included [kg/m^3]: one law for all, or a batch of laws."""
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
@@ -97,9 +94,6 @@ def relative_density(packing: Packing, radius: float, bottom: float, top: float)
     bottom = arguments.number(bottom, "bottom [m]")
     top = arguments.number(top, "top [m]", above=bottom)
     return float(packing.volume) / (math.pi * radius**2 * (top - bottom))
-
-
-# ---- its state -------------------------------------------------------------------------------------------------------
 
 
 class WallHistory(eqx.Module):
@@ -222,9 +216,6 @@ def check_state(state: State) -> None:
 def _behind(state: State) -> list[Bool[Array, " particles"]]:
     """Which particles are behind each wall."""
     return [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
-
-
-# ---- a state on disk -------------------------------------------------------------------------------------------------
 
 
 def save_state(path: str | Path, packing: Packing, state: State) -> None:

@@ -248,8 +248,6 @@ class Formulas(eqx.Module):
         return jnp.where(moved, contact.softened(factor).recovered(peak, secant).displacement, 0.0)
 
 
-# ---- the four numbers of a contact from law and size -----------------------------------------------------------------
-
 # Of unloading, of the shape factor, and A / L^2, which turns MPa and the unit of length into the unit of force.
 Form = tuple[Unloading, StrainScaling, float]
 Size = tuple[Scalar, Scalar, Scalar]  # shape factor eta_p, length L, and 1 / L, for derivatives a function of L

@@ -35,9 +35,6 @@ _RELEASED = Line2D([], [], color=UNLOADING, label="unloading, reloading", **_DOT
 _NOT_USED = Line2D([], [], color=style.PALE, label="not used", **_DOT)
 
 
-# ---- measured and calibrated -----------------------------------------------------------------------------------------
-
-
 def segments(kind: np.ndarray) -> list[np.ndarray]:
     """Rows of every segment."""
     return np.split(np.arange(len(kind)), np.flatnonzero(np.diff(kind)) + 1)

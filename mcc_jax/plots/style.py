@@ -81,9 +81,6 @@ def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: i
     return list(files)
 
 
-# ---- text from outside -----------------------------------------------------------------------------------------------
-
-
 def plain(text: str, longest: int = 24) -> str:
     """Any text as one short line that matplotlib draws literally, and as well as its font can."""
     font = get_font(findfont(FONT))
@@ -101,9 +98,6 @@ def particle_labels(names: Sequence[str], longest: int = 24) -> list[str]:
     ambiguous = {label for label, count in Counter(labels).items() if count > 1 or "\N{REPLACEMENT CHARACTER}" in label}
     ambiguous.add("")
     return [f"{label} (no. {i})".strip() if label in ambiguous else label for i, label in enumerate(labels, start=1)]
-
-
-# ---- layout ----------------------------------------------------------------------------------------------------------
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -58,9 +58,6 @@ def equation(text: str) -> Markup:
     return Markup(written)
 
 
-# ---- sentences -------------------------------------------------------------------------------------------------------
-
-
 def calibration_sentences(content: dict[str, Any], law: str = "the law") -> Iterator[str]:
     """A `calibration.json` in a few sentences; of the law "alone", which lacks something, no numbers are shown."""
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
@@ -150,9 +147,6 @@ def spread(log: dict[str, Any]) -> str:
         return "How much particles differ: hardly at all in these data."
     low, high = number(math.exp(mean - sd), 3), number(math.exp(mean + sd), 3)
     return f"How much particles differ: two of three lie between {low} and {high}."
-
-
-# ---- tables ----------------------------------------------------------------------------------------------------------
 
 
 def measured(campaign: Campaign) -> list[tuple[str, str]]:

@@ -144,8 +144,6 @@ def _content(tests: Tests) -> tuple[Any, ...]:
     return readings, sizes, tests.control
 
 
-# ---- diameters, which instrument files do not hold -------------------------------------------------------------------
-
 _SIZES = (
     "Give --diameters D1,D2,D3 in um for all, or --diameters FILE, a CSV or xlsx table with particle,D1_um,D2_um,D3_um"
 )
