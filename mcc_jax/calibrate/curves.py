@@ -96,10 +96,8 @@ def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
     if particle not in entries:
         raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {first_few(entries, 12)}.")
     if not entries[particle]["kept"]:
-        raise InputError(
-            f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}",
-            remedy="Take another particle or, without one, the population.",
-        )
+        problem = f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}"
+        raise InputError(problem, remedy="Take another particle or, without one, the population.")
     return entries[particle]
 
 

@@ -265,11 +265,8 @@ def calibrate_paper(
     if adjustment.kept.sum() < 2:
         problem = f"the calibration needs two usable particles or more, {adjustment.kept.sum()} can be used"
         if len(campaign) == 1:
-            raise InputError(
-                f"{problem}: this method compares particles",
-                file=campaign.source or None,
-                remedy="Test a second particle, or calibrate by another method (least-squares, bayes).",
-            )
+            remedy = "Test a second particle, or calibrate by another method (least-squares, bayes)."
+            raise InputError(f"{problem}: this method compares particles", file=campaign.source or None, remedy=remedy)
         raise refusal(campaign, problem, adjustment.reasons)
     with numbers_in_reach(campaign):
         table = steps.strain_table(adjustment, campaign.diameters_um)
@@ -322,11 +319,8 @@ def _reference_fit(
         return None
     index = None if name is None else campaign.index(name)
     if index is not None and index not in table.index:
-        raise InputError(
-            f"the reference particle {name!r} cannot be used",
-            file=campaign.source or None,
-            remedy="Name another one, or leave the choice to the paper's rule.",
-        )
+        remedy = "Name another one, or leave the choice to the paper's rule."
+        raise InputError(f"the reference particle {name!r} cannot be used", file=campaign.source or None, remedy=remedy)
     return steps.fit_shape_parameter(table, "reference", index)
 
 

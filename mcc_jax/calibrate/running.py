@@ -220,7 +220,5 @@ def require_same(tests: Tests) -> None:
         digest.update(np.asarray(x).tobytes())
     (digests,) = _exchanged([np.frombuffer(digest.digest(), np.uint8)])
     if len(np.unique(digests, axis=0)) > 1:
-        raise InputError(
-            "the processes were given different tests",
-            remedy="Every process must call the calibration with the same campaign and the same settings.",
-        )
+        remedy = "Every process must call the calibration with the same campaign and the same settings."
+        raise InputError("the processes were given different tests", remedy=remedy)

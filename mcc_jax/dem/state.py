@@ -206,10 +206,9 @@ def check_state(state: State) -> None:
     check_finite(np.asarray(state.position), at)
     for w, behind in enumerate(map(np.asarray, _behind(state))):
         if behind.any():
-            raise InputError(
-                f"particle {np.flatnonzero(behind)[0]} is outside wall {w} ({type(state.walls[w]).__name__}){at}",
-                remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
-            )
+            problem = f"particle {np.flatnonzero(behind)[0]} is outside wall {w} ({type(state.walls[w]).__name__}){at}"
+            remedy = "Place particles inside; if it was pushed through, a smaller time step or a slower punch."
+            raise InputError(problem, remedy=remedy)
 
 
 @jax.jit

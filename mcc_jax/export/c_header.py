@@ -167,10 +167,9 @@ def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> t
                 elif name in _OPERATIONS and not kind.ndim:
                     expression = _OPERATIONS[name].format(*results)
                 else:
-                    raise InputError(
-                        f"an effect of this law takes the operation {name}, which has no counterpart in C",
-                        remedy="Export the law as a JAX artefact (--format jax), or leave that effect out.",
-                    )
+                    problem = f"an effect of this law takes the operation {name}, which has no counterpart in C"
+                    remedy = "Export the law as a JAX artefact (--format jax), or leave that effect out."
+                    raise InputError(problem, remedy=remedy)
                 results = [f"t{len(statements)}"]
                 statements.append(("int" if kind.dtype.kind == "b" else "double", results[0], expression))
             known.update(zip(equation.outvars, results, strict=True))
