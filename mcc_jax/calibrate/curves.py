@@ -28,8 +28,7 @@ RIGID_MPA = 1e9  # where no test was unloaded the modulus cannot matter; a stiff
 
 # ---- laws ------------------------------------------------------------------------------------------------------------
 
-Variants = Mapping[str, Variant]
-"""The formulas of a law's effects, by "mechanism:variant"."""
+Variants = Mapping[str, Variant]  # the formulas of a law's effects, by "mechanism:variant"
 
 
 def law_of(

@@ -14,8 +14,7 @@ from .printing import say, say_files, say_json, say_next, say_table, sentence
 from .session import joint_model, provenance, read_without, session, write_result
 
 DISCOVERY, POWER = "discovery.json", "power.json"
-ROWS = 6
-"""Rows of the table; the file has all mechanisms."""
+ROWS = 6  # rows of the table; the file has all mechanisms
 
 
 @click.command(short_help="Find, name and add what the law misses.")

@@ -18,8 +18,7 @@ from .._numerics import recompute
 from .._types import Flag, Scalar
 from .walls import Vector, dot
 
-PADDING = np.iinfo(np.int64).max
-"""Key of a place in the list that no pair uses; sorts behind all others."""
+PADDING = np.iinfo(np.int64).max  # key of a place in the list that no pair uses; sorts behind all others
 
 
 class Edges(eqx.Module):

@@ -27,8 +27,7 @@ from .walls import Walls
 
 MCC_DENSITY = 1540.0
 """True density of microcrystalline cellulose, about [kg/m^3]."""
-SPARE = 1.1
-"""Length of a new list of edges over the pairs found."""
+SPARE = 1.1  # length of a new list of edges over the pairs found
 
 Vectors = Float[Array, "particles 3"]
 

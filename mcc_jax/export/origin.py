@@ -25,8 +25,7 @@ from ..effects import LIBRARY
 from ..geometry import Particle
 from ..law import MccLaw
 
-HUGE = 1e44
-"""Above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite."""
+HUGE = 1e44  # above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite
 _AGAIN = "Give a folder that mcc-jax calibrate or discover wrote, or calibrate again"
 _FALLING = "the loading curve is not monotone (9 C3^6 > 20 C1 C5^5): stress falls over part of the loading"
 

@@ -34,8 +34,7 @@ from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, 
 from .drive import refusal, simulate_batch
 from .programme import Instrument, Programme
 
-_STREAM = 0x0EFF_EC75
-"""Separates the draws of effects from those of noise, coefficients and peaks."""
+_STREAM = 0x0EFF_EC75  # separates the draws of effects from those of noise, coefficients and peaks
 
 
 @dataclass(frozen=True)
