@@ -91,9 +91,8 @@ def calibrate_many(
     `least_squares` with the same settings and seed, bit for bit. The posterior's mode "joint" pads points only.
 
     Args:
-        campaigns: the campaigns.
+        campaigns, threshold_MPa: the tests, and from which stress on they count, as in `sample`.
         method: "bayes" or "least-squares".
-        threshold_MPa: points below this stress on loading do not count [MPa].
         progress: called with a campaign's position and the name of its step, "done" or "failed" last.
         settings: of `sample` or `least_squares`: model, seed, chains, loss, ...; others raise a `TypeError`.
     """

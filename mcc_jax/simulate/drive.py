@@ -133,8 +133,7 @@ def simulate_batch(
     cannot drive it marks in `result`.
 
     Args:
-        laws: a law whose every array field has a leading axis N.
-        particles: a particle, likewise.
+        laws, particles: a law and a particle whose every array field has a leading axis N.
         paths: displacements [um] or forces [mN], shape (N, steps); pad shorter paths by repeating their last value.
         times: times [s], likewise, for laws with effects.
         relative_humidity: of every test [%], shape (N,), for laws with effects; the reference if None.
