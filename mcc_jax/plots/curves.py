@@ -168,12 +168,8 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
         raise InputError(f"there is no page {page}; there are {pages}, counted from 1")
     chosen = range((page - 1) * PAGE, min(page * PAGE, count))
     figure = _draw_particles(calibration, chosen)
-    handles = [
-        _MEASURED,
-        _RELEASED,
-        Line2D([], [], color=style.GREEN, linewidth=1.6, label="mean law"),
-        Line2D([], [], color=style.BLACK, linewidth=0.8, label="own coefficients"),
-    ]
+    handles = [_MEASURED, _RELEASED, Line2D([], [], color=style.GREEN, linewidth=1.6, label="mean law")]
+    handles.append(Line2D([], [], color=style.BLACK, linewidth=0.8, label="own coefficients"))
     if any(calibration.curves[i].why_not for i in chosen):
         handles.append(_NOT_USED)
     title = "Measured and predicted" + (f", page {page} of {pages}" if pages > 1 else "")

@@ -45,7 +45,6 @@ SMALL = 7.5
 RC: dict[Any, Any] = {
     "font.family": FONT,
     "font.size": 9.0,
-    "axes.labelsize": 9.0,
     "axes.titlesize": 9.0,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
