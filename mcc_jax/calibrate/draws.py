@@ -50,8 +50,7 @@ class Fit(eqx.Module):
         point: most probable numbers of every particle.
         residual: measured less predicted displacement there [um], 0 where masked.
         marginal: the tests there, with every particle's own numbers integrated out.
-        mode: of the population in unbounded coordinates, in the order of `names`.
-        covariance: of the same.
+        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
         converged: for particles, noise and population in turn.
     """
 
@@ -110,8 +109,7 @@ class Fit(eqx.Module):
 
 def exact_likelihood(fit: Fit) -> ExactLikelihood:
     """The tests of a fit with their exact likelihood."""
-    mean, sd = fit.model.zero_prior
-    return ExactLikelihood(fit.tests, fit.filters, fit.marginal, (mean, sd), fit.model.forms)
+    return ExactLikelihood(fit.tests, fit.filters, fit.marginal, tuple(fit.model.zero_prior), fit.model.forms)
 
 
 def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: bool) -> dict[str, Any]:

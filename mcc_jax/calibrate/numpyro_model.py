@@ -280,9 +280,7 @@ def spread(name: str, prior: NakagamiPrior) -> Scalar:
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    if isinstance(value, str | Variant):
-        return (value,)
-    return tuple(value)
+    return (value,) if isinstance(value, str | Variant) else tuple(value)
 
 
 def _variant(effect: Any) -> Variant:
