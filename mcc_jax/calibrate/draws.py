@@ -109,7 +109,8 @@ class Fit(eqx.Module):
 
 def exact_likelihood(fit: Fit) -> ExactLikelihood:
     """The tests of a fit with their exact likelihood."""
-    return ExactLikelihood(fit.tests, fit.filters, fit.marginal, tuple(fit.model.zero_prior), fit.model.forms)
+    mean, sd = fit.model.zero_prior
+    return ExactLikelihood(fit.tests, fit.filters, fit.marginal, (mean, sd), fit.model.forms)
 
 
 def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: bool) -> dict[str, Any]:
