@@ -70,10 +70,8 @@ def even_size(count: int, block: int) -> int:
 def _check(arguments: Any, shares: int) -> None:
     shapes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(arguments)}
     if len(shapes) != 1 or () in shapes:
-        raise InputError(
-            f"arrays of lengths {sorted(s[0] if s else 0 for s in shapes)} are not one batch of contacts",
-            remedy="Give every array one axis in front, of one length.",
-        )
+        problem = f"arrays of lengths {sorted(s[0] if s else 0 for s in shapes)} are not one batch of contacts"
+        raise InputError(problem, remedy="Give every array one axis in front, of one length.")
     (count,) = next(iter(shapes))
     if count % shares:
         raise InputError(f"{count} contacts cannot be shared by {shares} devices", remedy="Pad them to a multiple.")

@@ -1,7 +1,5 @@
 """Why a computation ended: readable reasons instead of codes."""
 
-from __future__ import annotations
-
 import optimistix as optx
 
 _NO_THROW = (

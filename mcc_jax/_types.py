@@ -16,10 +16,8 @@ from .arguments import values as values_of
 Scalar: TypeAlias = Float[Array, ""]
 Flag: TypeAlias = Bool[Array, ""]
 Path: TypeAlias = Float[Array, " steps"]
-Values: TypeAlias = Float[Array, "..."]
-"""One number or many at once, for functions that act on each alone."""
-Progress: TypeAlias = Callable[[str], None]
-"""Called with the name of each step of a long computation."""
+Values: TypeAlias = Float[Array, "..."]  # one number or many at once, for functions that act on each alone
+Progress: TypeAlias = Callable[[str], None]  # called with the name of each step of a long computation
 
 
 def scalar(value: ScalarLike) -> Scalar:
@@ -32,3 +30,13 @@ def scalar(value: ScalarLike) -> Scalar:
     if array.ndim:
         raise InputError(f"Expected a scalar, got shape {array.shape}; batch with equinox.filter_vmap(Class).")
     return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)
+
+
+def checked(check: Callable[..., None], name: str, **options: bool) -> Callable[[ScalarLike], Scalar]:
+    """`scalar` for a field whose plain numbers a check of `arguments` judges first."""
+
+    def convert(value: ScalarLike) -> Scalar:
+        check(value, name, **options)
+        return scalar(value)
+
+    return convert

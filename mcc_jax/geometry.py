@@ -12,13 +12,10 @@ import numpy as np
 
 from ._format import described
 from ._numerics import compiled_whole, positive_pow, recompute
-from ._types import Scalar, ScalarLike, Values, scalar
+from ._types import Scalar, ScalarLike, Values, checked, scalar
 from .arguments import diameters, finite, is_traced, positive
 
-
-def _diameter(value: ScalarLike) -> Scalar:
-    positive(value, "a particle's diameter [um]")
-    return scalar(value)
+_diameter = checked(positive, "a particle's diameter [um]")
 
 
 class Particle(eqx.Module):

@@ -39,10 +39,8 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     if not models:
         raise InputError("there is no model to compare")
     if any((one.model if isinstance(one, Posterior) else one).robust for one in models):
-        raise InputError(
-            "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's",
-            remedy="Compare models with robust=False.",
-        )
+        problem = "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's"
+        raise InputError(problem, remedy="Compare models with robust=False.")
     found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
     tests = [(one.particles, np.asarray(one.selection.tests.mask).sum(1).tolist()) for one in found]
     if any(one != tests[0] for one in tests):
@@ -93,9 +91,8 @@ def calibrate_many(
     `least_squares` with the same settings and seed, bit for bit. The posterior's mode "joint" pads points only.
 
     Args:
-        campaigns: the campaigns.
+        campaigns, threshold_MPa: the tests, and from which stress on they count, as in `sample`.
         method: "bayes" or "least-squares".
-        threshold_MPa: points below this stress on loading do not count [MPa].
         progress: called with a campaign's position and the name of its step, "done" or "failed" last.
         settings: of `sample` or `least_squares`: model, seed, chains, loss, ...; others raise a `TypeError`.
     """

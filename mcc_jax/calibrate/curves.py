@@ -28,8 +28,7 @@ RIGID_MPA = 1e9  # where no test was unloaded the modulus cannot matter; a stiff
 
 # ---- laws ------------------------------------------------------------------------------------------------------------
 
-Variants = Mapping[str, Variant]
-"""The formulas of a law's effects, by "mechanism:variant"."""
+Variants = Mapping[str, Variant]  # the formulas of a law's effects, by "mechanism:variant"
 
 
 def law_of(
@@ -96,10 +95,8 @@ def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
     if particle not in entries:
         raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {first_few(entries, 12)}.")
     if not entries[particle]["kept"]:
-        raise InputError(
-            f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}",
-            remedy="Take another particle or, without one, the population.",
-        )
+        problem = f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}"
+        raise InputError(problem, remedy="Take another particle or, without one, the population.")
     return entries[particle]
 
 

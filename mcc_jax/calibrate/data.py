@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -217,8 +217,7 @@ def records_of(
     return Record(**{name: jnp.asarray(x) for name, x in together.items()}), reading, error
 
 
-@dataclass(frozen=True)
-class _Prepared:
+class _Prepared(NamedTuple):
     rows: np.ndarray
     mask: np.ndarray
     loading: np.ndarray

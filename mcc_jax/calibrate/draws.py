@@ -50,8 +50,7 @@ class Fit(eqx.Module):
         point: most probable numbers of every particle.
         residual: measured less predicted displacement there [um], 0 where masked.
         marginal: the tests there, with every particle's own numbers integrated out.
-        mode: of the population in unbounded coordinates, in the order of `names`.
-        covariance: of the same.
+        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
         converged: for particles, noise and population in turn.
     """
 

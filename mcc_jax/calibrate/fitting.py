@@ -91,9 +91,8 @@ def prepare(
     selection = selection if note is None else replace(selection, notes=(*selection.notes, note))
     require_same(selection.tests)
     if start is not None and start.point.theta.shape != (len(selection.kept), len(model.forms.names)):
-        raise InputError(
-            "start is of other particles or effects", remedy="Give the fit of the same campaign and the same model."
-        )
+        problem = "start is of other particles or effects"
+        raise InputError(problem, remedy="Give the fit of the same campaign and the same model.")
     read_out = float(np.median([point_noise(campaign.curves[i].displacement_um) for i in selection.kept]))
     found = fit_tests(selection.tests, model, read_out, start=start, progress=progress, **settings)
     parts = (found.point.latent, found.point.zero, found.mode, found.covariance)

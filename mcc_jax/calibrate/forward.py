@@ -32,8 +32,7 @@ from ..law.derivatives import Formula, Numbers, along, padded
 from .data import Tests
 from .running import Blocks
 
-Latent = Float[Array, " 4"]
-"""b1, b3, b5 and e of one particle."""
+Latent = Float[Array, " 4"]  # b1, b3, b5 and e of one particle
 
 
 @functools.cache

@@ -138,11 +138,9 @@ def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
         # A ValueError of ours is about an argument; those of NumPy and SciPy that are meant here speak of NaN.
         if not isinstance(error, ArithmeticError | np.linalg.LinAlgError) and "infs or NaN" not in text:
             raise
-        problem, remedy = add_likely_unit_error(
-            campaign,
-            f"the law cannot be fitted to these tests: their numbers are beyond what arithmetic can resolve ({text})",
-            "Look at the curves, leave out the test that is unlike the others, and check the units",
-        )
+        problem = "the law cannot be fitted to these tests: their numbers are beyond what arithmetic can resolve"
+        remedy = "Look at the curves, leave out the test that is unlike the others, and check the units"
+        problem, remedy = add_likely_unit_error(campaign, f"{problem} ({text})", remedy)
         raise InputError(problem, file=campaign.source or None, remedy=remedy) from None
 
 

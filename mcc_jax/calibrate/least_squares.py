@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal, get_args
@@ -41,8 +42,7 @@ class Identifiability:
     Attributes:
         singular_values: of the curvature, every parameter on its own scale, largest first. All would be 1 if the
             parameters did not interact; 0 marks a combination that the data leave open.
-        directions: the combinations, one row each, in the order of `names`.
-        names: of the parameters.
+        directions, names: the combinations, one row each, and the parameters that the columns are of.
     """
 
     singular_values: np.ndarray
@@ -103,16 +103,16 @@ class LeastSquares(JointCalibration):
         names = (*SHARED, *self.model.forms.names)
         return Identifiability(np.maximum(values[::-1], 0.0), vectors.T[::-1], names)
 
-    def _notes(self) -> list[str]:
-        notes = [f"the data leave this combination open: {text}" for text in self.identifiability.open]
+    def _notes(self) -> Iterator[str]:
+        yield from (f"the data leave this combination open: {text}" for text in self.identifiability.open)
         agree, count = self.agreeing_starts
         if agree < count:
-            notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
+            yield f"{count - agree} of {count} starts ended at a worse optimum"
         if self._alone:
-            notes.append("one particle says nothing of the scatter between particles: no spread is given")
+            yield "one particle says nothing of the scatter between particles: no spread is given"
         elif small := [n for n, t in zip(COEFFICIENTS, self.settings.population.tau, strict=True) if t < 1e-3]:
-            notes.append(f"the spread of {', '.join(small)} cannot be distinguished from zero")
-        return notes + super()._notes()
+            yield f"the spread of {', '.join(small)} cannot be distinguished from zero"
+        yield from super()._notes()
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""

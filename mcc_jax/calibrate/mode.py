@@ -25,7 +25,6 @@ from .running import compiled, padded, side_by_side
 
 handlers: Any = numpyro.handlers
 
-
 # Found by trial on simulated campaigns (`benchmarks/study_modes.py`).
 SHARP = 0.03  # sd of the log of a polynomial's coefficient below which one Newton step integrates a particle out
 DENSITIES, DENSITIES_AT_ONCE = 250, 10  # coordinates in one call, and side by side: a part of the former, no remainder

@@ -280,17 +280,14 @@ def spread(name: str, prior: NakagamiPrior) -> Scalar:
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    if isinstance(value, str | Variant):
-        return (value,)
-    return tuple(value)
+    return (value,) if isinstance(value, str | Variant) else tuple(value)
 
 
 def _variant(effect: Any) -> Variant:
     found = find_variant(effect) if isinstance(effect, str) else effect
     for nuisance in found.nuisances:
         if nuisance.random_per_test:
-            raise InputError(
-                f"{nuisance.name} of {found.mechanism}:{found.name} differs at random from test to test",
-                remedy="A model has one value for all tests; take another formula of the mechanism.",
-            )
+            problem = f"{nuisance.name} of {found.mechanism}:{found.name} differs at random from test to test"
+            remedy = "A model has one value for all tests; take another formula of the mechanism."
+            raise InputError(problem, remedy=remedy)
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -139,26 +139,18 @@ class PaperCalibration(Calibration):
         """Why shape parameter or modulus could not be found."""
         return [reason for reason in (self.chosen_shape.reason, self.elastic.reason) if reason]
 
-    def _notes(self) -> list[str]:
-        notes = []
-        if self.plastic.at_bound:
-            notes.append(
-                f"{', '.join(self.plastic.at_bound)} ended at the lower bound: a collapsed estimate, not a measurement"
-            )
+    def _notes(self) -> Iterator[str]:
+        if bound := ", ".join(self.plastic.at_bound):
+            yield f"{bound} ended at the lower bound: a collapsed estimate, not a measurement"
         if not bool(self.mean_law.is_monotone):
-            notes.append("the mean law is not monotone: under load control it snaps through")
+            yield "the mean law is not monotone: under load control it snaps through"
         share = float(self.plastic.population.probability_not_monotone)
         if share > 0.05:
-            notes.append(
-                f"{100 * share:.0f} % of particles drawn from this population would have a law that is not monotone"
-            )
+            yield f"{100 * share:.0f} % of particles drawn from this population would have a law that is not monotone"
         largest = float(self.table.shape_factor(self.a).max())
         if largest > LARGEST_SHAPE_FACTOR:
-            notes.append(
-                f"a = {self.a:.3g} makes shape factors of up to {largest:.3g}: "
-                "the shape factor does not bring these curves together"
-            )
-        return notes
+            factors = f"a = {self.a:.3g} makes shape factors of up to {largest:.3g}"
+            yield f"{factors}: the shape factor does not bring these curves together"
 
     @property
     def _compared(self) -> dict[str, ParticleFit]:
@@ -173,11 +165,8 @@ class PaperCalibration(Calibration):
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
-        return {
-            "converged": self.converged,
-            "a": estimate(self.a),
-            "effective_modulus_MPa": estimate(self.elastic.effective_modulus_MPa),
-        }
+        modulus = estimate(self.elastic.effective_modulus_MPa)
+        return {"converged": self.converged, "a": estimate(self.a), "effective_modulus_MPa": modulus}
 
     def _further_content(self) -> dict[str, Any]:
         population = self.plastic.population
@@ -245,8 +234,7 @@ def calibrate_paper(
         threshold_MPa: stress of the offset step [MPa]; 0 leaves it out (and removes its bias on `a`).
         objective: "full" or "reference", which objective's `a` the rest is built on; both are fitted and reported.
         reference: name of the reference particle; by the paper's rule if None.
-        unloading: form of unloading that the modulus belongs to.
-        strain_scaling: how the shape factor enters unloading.
+        unloading, strain_scaling: as of `MccLaw`.
         seed: kept for the record.
         without_flagged, progress: as in `sample`.
 
@@ -265,11 +253,8 @@ def calibrate_paper(
     if adjustment.kept.sum() < 2:
         problem = f"the calibration needs two usable particles or more, {adjustment.kept.sum()} can be used"
         if len(campaign) == 1:
-            raise InputError(
-                f"{problem}: this method compares particles",
-                file=campaign.source or None,
-                remedy="Test a second particle, or calibrate by another method (least-squares, bayes).",
-            )
+            remedy = "Test a second particle, or calibrate by another method (least-squares, bayes)."
+            raise InputError(f"{problem}: this method compares particles", file=campaign.source or None, remedy=remedy)
         raise refusal(campaign, problem, adjustment.reasons)
     with numbers_in_reach(campaign):
         table = steps.strain_table(adjustment, campaign.diameters_um)
@@ -322,11 +307,8 @@ def _reference_fit(
         return None
     index = None if name is None else campaign.index(name)
     if index is not None and index not in table.index:
-        raise InputError(
-            f"the reference particle {name!r} cannot be used",
-            file=campaign.source or None,
-            remedy="Name another one, or leave the choice to the paper's rule.",
-        )
+        remedy = "Name another one, or leave the choice to the paper's rule."
+        raise InputError(f"the reference particle {name!r} cannot be used", file=campaign.source or None, remedy=remedy)
     return steps.fit_shape_parameter(table, "reference", index)
 
 

@@ -275,10 +275,9 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     use = (master.stress_MPa >= threshold_MPa) & (master.stress_MPa > 0) & (master.mean > 0)
     x, stress, sd, count = (v[use] for v in (master.mean, master.stress_MPa, master.sd, master.count))
     if len(x) < 4:
-        raise InputError(
-            "the master curve has fewer than four points of positive strain above the threshold",
-            remedy="Check the sign of displacement (positive as the platens approach), or lower the threshold.",
-        )
+        problem = "the master curve has fewer than four points of positive strain above the threshold"
+        remedy = "Check the sign of displacement (positive as the platens approach), or lower the threshold."
+        raise InputError(problem, remedy=remedy)
     means, low = fit_polynomial(x, stress)
     K1, K3, K5 = means
     variance = ((K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * sd) ** 2

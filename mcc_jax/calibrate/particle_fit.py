@@ -22,7 +22,6 @@ STEPS = 200  # most steps of a particle's fit
 UNSEEN = 4.0  # a fit without unseen snap-through is preferred up to so many times the least sum of squares
 GAIN = 1e-6  # log probability still to gain at which a fit is finished, where residuals are as large as the noise
 
-
 snaps = compiled(jax.vmap(snap))
 
 
@@ -61,10 +60,8 @@ def linear_start(stress: np.ndarray, strain: np.ndarray) -> tuple[np.ndarray, fl
 
 def linear_starts(tests: Tests, log_modulus: float) -> np.ndarray:
     """Several starts for every particle, shape (particles, starts, 5): the linear one and variations of it."""
-    force, displacement, loading, contact = (
-        np.asarray(x) for x in (tests.force, tests.displacement, tests.loading, tests.contact)
-    )
-    reach = np.asarray(tests.effective_diameter)
+    given = tests.force, tests.displacement, tests.loading, tests.contact, tests.effective_diameter
+    force, displacement, loading, contact, reach = map(np.asarray, given)
     first = np.full((len(tests), 5), log_modulus)
     for row, used in enumerate(loading):
         # [mN] over [um^2] is 1e3 MPa.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -105,23 +106,18 @@ class Posterior(PosteriorDraws):
                 "that the fast mode takes it for; use --mode joint, or leave the particle out"
             )
         if self.pareto_k_joint is not None and not self.pareto_k_joint <= MOST_PARETO_K:
-            found.append(
-                f"Pareto k of all particles together is {self.pareto_k_joint:.2f}, above {MOST_PARETO_K}: "
-                "use --mode joint"
-            )
+            joint = f"Pareto k of all particles together is {self.pareto_k_joint:.2f}"
+            found.append(f"{joint}, above {MOST_PARETO_K}: use --mode joint")
         return found
 
-    def _notes(self) -> list[str]:
-        notes = super()._notes()
-        count = len(self.particles)
-        if count < 3:
-            notes.append(f"{count} particles say little about a population: its spread is mostly the prior")
+    def _notes(self) -> Iterator[str]:
+        yield from super()._notes()
+        if (count := len(self.particles)) < 3:
+            yield f"{count} particles say little about a population: its spread is mostly the prior"
         if np.ptp(np.asarray(self.selection.tests.flatness)) < 0.02:
-            notes.append("all particles have the same shape, which does not determine a: a is its prior")
-        share = float(np.mean(self.probability_not_monotone()))
-        if share > 0.05:
-            notes.append(f"{100 * share:.0f} % of new particles would have a law that is not monotone (snap-through)")
-        return notes
+            yield "all particles have the same shape, which does not determine a: a is its prior"
+        if (share := float(np.mean(self.probability_not_monotone()))) > 0.05:
+            yield f"{100 * share:.0f} % of new particles would have a law that is not monotone (snap-through)"
 
     def probability_not_monotone(self) -> np.ndarray:
         """Share of a new particle's laws that are not monotone, one number per draw of the population."""

@@ -155,8 +155,7 @@ def predict_new_particle(
         diameters_um: its D1, D2, D3 [um].
         force_mN: path of forces, loading and unloading [mN], shape (n,).
         time_s: times of the same points [s], for effects that depend on time; none passes if None.
-        count: number of draws.
-        seed: random seed.
+        count, seed: number of draws, and the seed of their random numbers.
 
     Raises:
         InputError: for diameters that are not positive, or a path that is none.
@@ -211,9 +210,6 @@ def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
     return [{"quantity": name, "paper": value, **summary(named[name])} for name, value in paper.items()]
 
 
-# ---- ArviZ -----------------------------------------------------------------------------------------------------------
-
-
 def prior_draws(calibration: PosteriorDraws, count: int, seed: int) -> dict[str, np.ndarray]:
     """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
     flatness = np.asarray(calibration.fit.tests.flatness)
@@ -236,12 +232,8 @@ def data_tree(c: Any, seed: int) -> DataTree:
 
     prior = prior_draws(c, PRIOR_DRAWS, arguments.seed(seed))
     tests, mask, varying = c.selection.tests, np.asarray(c.selection.tests.mask), c.model.varying_places
-    posterior: dict[str, Any] = _variables(c.population, c.model) | {
-        "yield_stress_MPa": c.yield_stress_MPa(),
-        "C": c.C,
-        "zero_um": c.zero_um,
-        "eta_p": c.shape_factor,
-    }
+    posterior: dict[str, Any] = _variables(c.population, c.model) | {"yield_stress_MPa": c.yield_stress_MPa()}
+    posterior |= {"C": c.C, "zero_um": c.zero_um, "eta_p": c.shape_factor}
     if c.model.modulus_scatter:
         posterior["particle_modulus_MPa"] = c.modulus_MPa
     posterior |= {f"particle_{name}": c.theta[..., k] for name, k in varying.items()}

@@ -180,10 +180,8 @@ class Priors:
     def to_json(self) -> dict[str, Any]:
         """Every prior with its numbers."""
         names = {NormalPrior: "normal", LogNormalPrior: "log-normal", NakagamiPrior: "nakagami"}
-        return {
-            name: {"distribution": names[type(prior)], **dataclasses.asdict(prior)}
-            for name, prior in vars(self).items()
-        }
+        known = vars(self).items()
+        return {name: {"distribution": names[type(one)], **dataclasses.asdict(one)} for name, one in known}
 
 
 def bounds_of_a(flatness: Any) -> tuple[Any, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -150,7 +150,7 @@ class Calibration(Saved):
             "either it describes these tests badly, or they are not compressions of single particles"
         ]
 
-    def _notes(self) -> list[str]:
+    def _notes(self) -> Iterator[str]:
         """What else a reader must know."""
         raise NotImplementedError
 
@@ -282,15 +282,14 @@ class JointCalibration(Calibration):
         correlated = (np.asarray(noise.scale) * float(noise.correlated)) ** 2
         return variance / np.maximum(mask.sum(1), 1), correlated
 
-    def _notes(self) -> list[str]:
-        notes, share = [*self.selection.notes, *self.notes], self.noise_share
-        if share > CORRELATED_SHARE:
-            notes.append(
-                f"the law misses displacements by {self._missed}; {100 * share:.0f} % of that is correlated along a "
-                "test: more likely something that the law lacks than noise of the instrument; mcc_jax.discover looks "
-                "for what it is"
+    def _notes(self) -> Iterator[str]:
+        yield from (*self.selection.notes, *self.notes)
+        if self.noise_share > CORRELATED_SHARE:
+            yield (
+                f"the law misses displacements by {self._missed}; {100 * self.noise_share:.0f} % of that is correlated "
+                "along a test: more likely something that the law lacks than noise of the instrument; mcc_jax.discover "
+                "looks for what it is"
             )
-        return notes
 
     def _noise_numbers(self) -> dict[str, Any]:
         """Estimates of the noise by their names in files."""

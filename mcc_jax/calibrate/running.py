@@ -78,8 +78,6 @@ def make_room() -> None:
         jax.clear_caches()
 
 
-# ---- blocks of particles ---------------------------------------------------------------------------------------------
-
 AXIS = "particles"  # the only axis of the mesh of a process's devices
 
 # Sizes of a campaign that is one block: those between are padded, so that few sizes are compiled. The last is the
@@ -222,7 +220,5 @@ def require_same(tests: Tests) -> None:
         digest.update(np.asarray(x).tobytes())
     (digests,) = _exchanged([np.frombuffer(digest.digest(), np.uint8)])
     if len(np.unique(digests, axis=0)) > 1:
-        raise InputError(
-            "the processes were given different tests",
-            remedy="Every process must call the calibration with the same campaign and the same settings.",
-        )
+        remedy = "Every process must call the calibration with the same campaign and the same settings."
+        raise InputError("the processes were given different tests", remedy=remedy)

@@ -108,10 +108,7 @@ def parse_metadata(text: str, file: Path) -> Metadata:
     """The metadata that the text of a `campaign.toml` holds; keys it does not know go to `other`."""
     entries = load_toml(text, file)
     known = typed({key: entries.pop(key) for key in _WRITE if key in entries}, _Known, file, _WRITE)
-    sizes = {
-        f"{quantity}_{CANONICAL[dimension]}": _positive(entries, quantity, dimension, file)
-        for quantity, dimension in _QUANTITIES.items()
-    }
+    sizes = {f"{name}_{CANONICAL[kind]}": _positive(entries, name, kind, file) for name, kind in _QUANTITIES.items()}
     return Metadata(known.control, **sizes, provenance=known.provenance, corrections=known.corrections, other=entries)
 
 

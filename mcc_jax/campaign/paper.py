@@ -1,7 +1,5 @@
 """The paper's own numbers: Table 1 (diameters), Table 2 (plastic coefficients), a and the effective modulus."""
 
-from __future__ import annotations
-
 import numpy as np
 
 PAPER_DIAMETERS_UM = np.array(

@@ -8,7 +8,7 @@ records' own stiffness by the same factor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -202,12 +202,11 @@ def _unit_finding(tests: _Tests, errors: Sequence[UnitError], odds: np.ndarray, 
     return _finding(sentence, remedy, names)
 
 
-def _signs(tests: _Tests) -> list[Finding]:
+def _signs(tests: _Tests) -> Iterator[Finding]:
     """Forces or displacements that are negative in compression."""
     force, displacement = tests.features.force_sign < 0, tests.features.displacement_sign < 0
     heights = np.log10(tests.features.force_mN)
     real = heights > _median(heights) - 1.5  # a record without a particle has a sign, too
-    found = []
     for turned, columns, seen in (
         (force & displacement, ("force_mN", "displacement_um"), "both go below zero as the load rises"),
         (force & ~displacement, ("force_mN",), "the load rises as the force falls below zero"),
@@ -219,8 +218,7 @@ def _signs(tests: _Tests) -> list[Finding]:
             what = f"the {' and '.join(f'{channel}s' for channel in channels)} of {_who(names)}"
             sentence = f"{what} seem to have the wrong sign: {seen}, and compression is positive here"
             remedy = f"reverse the sign of {' and '.join(columns)} in curves.csv, or write sign = -1 for"
-            found.append(_finding(sentence, f"{remedy} {' and '.join(channels)} in the mapping file", names))
-    return found
+            yield _finding(sentence, f"{remedy} {' and '.join(channels)} in the mapping file", names)
 
 
 def _clock(features: CurveFeatures) -> list[Finding]:
@@ -260,15 +258,14 @@ def _order_of_diameters(diameters_um: np.ndarray) -> list[Finding]:
     return [_finding(sentence, f"D3 is the diameter along the compression; {exchange}")]
 
 
-def _outside(tests: _Tests) -> list[Finding]:
+def _outside(tests: _Tests) -> Iterator[Finding]:
     """Numbers beyond every range though no unit error explains them."""
-    found: list[Finding] = []
     closed = unit_errors.closure(tests.numbers) > 0
     if closed.any():
         names = tests.some(closed)
         sentence = f"the displacement of {_who(names)} exceeds the diameter D3, so that the platens would have touched"
         remedy = "check the diameters and the zero of displacement"
-        found.append(_finding(sentence, remedy, names, "warning" if names else "error"))
+        yield _finding(sentence, remedy, names, "warning" if names else "error")
     numbers = _typical(tests.numbers)
     it = apparent(numbers)
     for what, unit, value, (low, high) in (
@@ -283,8 +280,8 @@ def _outside(tests: _Tests) -> list[Finding]:
                 f" ({low:g} to {high:g} {unit}), and no single unit error explains it"
             )
             remedy = "check the units of force, displacement and diameters, and that tests are of single particles"
-            return [*found, _finding(sentence, remedy)]
-    return found
+            yield _finding(sentence, remedy)
+            return
 
 
 def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Finding]:

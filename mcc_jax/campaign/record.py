@@ -117,8 +117,7 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
 
     Changes of speed are kinks, believed where straight lines that meet describe the force better than one line and than
     any polynomial of as many numbers, by the Bayesian information criterion (Schwarz 1978; a kink counts as three
-    numbers, Zhang and Siegmund 2007). A ramp without duration, and a piece
-    of one that does not move, keep the rate `before` them.
+    numbers, Zhang and Siegmund 2007). A ramp without duration, and a piece that does not move, keep the rate `before`.
     """
     if len(time) < 2 or np.ptp(time) <= 0:
         return np.full(len(time), before)
@@ -217,10 +216,8 @@ def available_data(campaign: Campaign) -> frozenset[Need]:
         loading = np.isin(record["kind"], (1, 4))
         rates.extend(np.unique(record["loading_rate"][loading]).tolist())
         area = np.pi * diameter**2 / 4 * 1e-3
-        peaks.append(float(curve.force_mN.max() / area))
-        peaks.extend(
-            float(curve.force_mN[: part.start].max() / area) for part in parts if part.kind == "unload" and part.start
-        )
+        ends = [part.start for part in parts if part.kind == "unload" and part.start]
+        peaks += [float(curve.force_mN[:end].max() / area) for end in (None, *ends)]
         durations.append(float(curve.time_s[-1] - curve.time_s[0]))
         low += int(np.sum(curve.force_mN < 0.1 * curve.force_mN.max()) >= 5)
     humidity = humidities(campaign)

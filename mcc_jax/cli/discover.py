@@ -14,18 +14,19 @@ from .printing import say, say_files, say_json, say_next, say_table, sentence
 from .session import joint_model, provenance, read_without, session, write_result
 
 DISCOVERY, POWER = "discovery.json", "power.json"
-ROWS = 6
-"""Rows of the table; the file has all mechanisms."""
+ROWS = 6  # rows of the table; the file has all mechanisms
+
+
+def _of_the_law(command: Any) -> Any:
+    """The options that both commands have."""
+    given = common.campaign, common.out(required=True), common.exclude, common.leave_out()
+    for option in reversed((*given, common.threshold(default=0.0), common.priors(), common.law)):
+        command = option(command)
+    return command
 
 
 @click.command(short_help="Find, name and add what the law misses.")
-@common.campaign
-@common.out(required=True)
-@common.exclude
-@common.leave_out()
-@common.threshold(default=0.0)
-@common.priors()
-@common.law
+@_of_the_law
 @click.option(
     "--no-held-out", is_flag=True, help="Do not repeat the search without each particle: no gap on unseen particles."
 )
@@ -111,13 +112,7 @@ def say_discovery(content: dict[str, Any]) -> None:
 
 
 @click.command(short_help="Say what a planned campaign could show.")
-@common.campaign
-@common.out(required=True)
-@common.exclude
-@common.leave_out()
-@common.threshold(default=0.0)
-@common.priors()
-@common.law
+@_of_the_law
 @common.json(POWER, "a table")
 def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
     """Say how large each mechanism must be for the tests in the folder CAMPAIGN to show it, and which they cannot

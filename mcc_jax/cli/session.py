@@ -11,7 +11,7 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,15 +180,6 @@ def provenance(
     }
 
 
-def drop_earlier(stage: Stage, result: str, names: Sequence[str]) -> None:
-    """Files that an earlier `result` lists as its own become stale, but for those that this run writes."""
-    with contextlib.suppress(ValueError, AttributeError, TypeError, RecursionError):  # there is none, or it is damaged
-        earlier = json.loads(read_regular(stage.directory / result, RESULT_BYTES, ""))
-        listed = [name for key in ("figures", "files") for name in earlier.get(key, ())]
-        own = [name for name in listed if isinstance(name, str) and OWN_FILES.fullmatch(name)]
-        stage.stale += [name for name in own if name not in names]
-
-
 def write_result(
     result: Calibration | Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, progress: Progress
 ) -> dict[str, Any]:
@@ -205,7 +196,12 @@ def write_result(
             import h5py  # noqa: F401
         result.to_arviz(seed=result.seed).to_netcdf(stage.folder / POSTERIOR, engine="h5netcdf")
         files.append(POSTERIOR)
-    drop_earlier(stage, result.content_file, [*names, *files])
+    # Files that an earlier result lists as its own become stale, but for those that this run writes.
+    with contextlib.suppress(ValueError, AttributeError, TypeError, RecursionError):  # there is none, or it is damaged
+        earlier = json.loads(read_regular(stage.directory / result.content_file, RESULT_BYTES, ""))
+        listed = [name for key in ("figures", "files") for name in earlier.get(key, ())]
+        own = [name for name in listed if isinstance(name, str) and OWN_FILES.fullmatch(name)]
+        stage.stale += [name for name in own if name not in (*names, *files)]
     return result.write(stage.folder, figures=names, files=files, provenance=dict(origin))
 
 

@@ -24,15 +24,11 @@ def edges_from_jaxmd(neighbours: Any, capacity: int | None = None) -> Edges:
     """
     index, count = np.asarray(neighbours.idx), len(neighbours.reference_position)
     if "Sparse" not in str(neighbours.format):
-        raise InputError(
-            f"a neighbour list of format {neighbours.format}",
-            remedy="Make it with `format=jax_md.partition.NeighborListFormat.OrderedSparse`.",
-        )
+        problem = f"a neighbour list of format {neighbours.format}"
+        raise InputError(problem, remedy="Make it with `format=jax_md.partition.NeighborListFormat.OrderedSparse`.")
     if bool(neighbours.did_buffer_overflow):
-        raise InputError(
-            "jax-md's neighbour list overflowed: pairs are missing",
-            remedy="Allocate it again: `neighbours = neighbour_fn.allocate(position)`.",
-        )
+        problem = "jax-md's neighbour list overflowed: pairs are missing"
+        raise InputError(problem, remedy="Allocate it again: `neighbours = neighbour_fn.allocate(position)`.")
     pairs = index.T[(index < count).all(axis=0)]  # places not used name particle N
     return list_edges(pairs, count, index.shape[1] if capacity is None else capacity)
 

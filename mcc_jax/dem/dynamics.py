@@ -250,9 +250,6 @@ def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, 
     return single(packing), single(motion), replace(state, **history)
 
 
-# ---- contacts divided over devices and processes: each computes its share, one sum a step brings them together -------
-
-
 def sharded[Moving: eqx.Module](
     loop: Callable[..., tuple[Moving, Any]],
     devices: Devices | None,

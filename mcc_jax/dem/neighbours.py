@@ -18,8 +18,7 @@ from .._numerics import recompute
 from .._types import Flag, Scalar
 from .walls import Vector, dot
 
-PADDING = np.iinfo(np.int64).max
-"""Key of a place in the list that no pair uses; sorts behind all others."""
+PADDING = np.iinfo(np.int64).max  # key of a place in the list that no pair uses; sorts behind all others
 
 
 class Edges(eqx.Module):
@@ -131,10 +130,8 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
     is paired with itself, or without double precision.
     """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError(
-            "keys of contacts need 64 bits",
-            remedy='jax.config.update("jax_enable_x64", True) first; positions and forces may still be float32.',
-        )
+        remedy = 'jax.config.update("jax_enable_x64", True) first; positions and forces may still be float32.'
+        raise InputError("keys of contacts need 64 bits", remedy=remedy)
     pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
     low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
     wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))

@@ -291,9 +291,6 @@ def die_walls(walls: Walls) -> tuple[Plane, Plane, Cylinder]:
     raise InputError("walls that are not bottom punch, top punch and barrel", remedy="Make them with `die`.")
 
 
-# ---- the load steps again --------------------------------------------------------------------------------------------
-
-
 class Replayed(NamedTuple):
     """The load steps again, differentiable: forces on bottom, top and barrel along their normals [N], centres [m],
     edges and wall history at the end, residuals, sums of the springs' axial forces without sign [N].

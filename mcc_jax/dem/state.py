@@ -27,8 +27,7 @@ from .walls import Walls
 
 MCC_DENSITY = 1540.0
 """True density of microcrystalline cellulose, about [kg/m^3]."""
-SPARE = 1.1
-"""Length of a new list of edges over the pairs found."""
+SPARE = 1.1  # length of a new list of edges over the pairs found
 
 Vectors = Float[Array, "particles 3"]
 
@@ -46,9 +45,6 @@ class Packing(eqx.Module):
     def volume(self) -> Scalar:
         """Volume of all spheres [m^3], overlaps not taken off."""
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
-
-
-# ---- how it is made --------------------------------------------------------------------------------------------------
 
 
 def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing:
@@ -97,9 +93,6 @@ def relative_density(packing: Packing, radius: float, bottom: float, top: float)
     bottom = arguments.number(bottom, "bottom [m]")
     top = arguments.number(top, "top [m]", above=bottom)
     return float(packing.volume) / (math.pi * radius**2 * (top - bottom))
-
-
-# ---- its state -------------------------------------------------------------------------------------------------------
 
 
 class WallHistory(eqx.Module):
@@ -194,11 +187,9 @@ def check_packing(packing: Packing) -> None:
     """Refuse half contacts that resist nothing, naming the first such particle."""
     valid = np.asarray(jax.vmap(lambda side: side.is_valid)(packing.sides))
     valid = valid & np.asarray((packing.radius > 0) & (packing.mass > 0))
-    if not valid.all():
-        raise InputError(
-            f"particle {np.flatnonzero(~valid)[0]} has no positive radius, mass or stiffness, or a shape factor <= 0",
-            remedy="Check its coefficients and diameters.",
-        )
+    for first in np.flatnonzero(~valid):
+        problem = f"particle {first} has no positive radius, mass or stiffness, or a shape factor <= 0"
+        raise InputError(problem, remedy="Check its coefficients and diameters.")
 
 
 def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
@@ -212,19 +203,15 @@ def check_state(state: State) -> None:
     check_finite(np.asarray(state.position), at)
     for w, behind in enumerate(map(np.asarray, _behind(state))):
         if behind.any():
-            raise InputError(
-                f"particle {np.flatnonzero(behind)[0]} is outside wall {w} ({type(state.walls[w]).__name__}){at}",
-                remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
-            )
+            problem = f"particle {np.flatnonzero(behind)[0]} is outside wall {w} ({type(state.walls[w]).__name__}){at}"
+            remedy = "Place particles inside; if it was pushed through, a smaller time step or a slower punch."
+            raise InputError(problem, remedy=remedy)
 
 
 @jax.jit
 def _behind(state: State) -> list[Bool[Array, " particles"]]:
     """Which particles are behind each wall."""
     return [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
-
-
-# ---- a state on disk -------------------------------------------------------------------------------------------------
 
 
 def save_state(path: str | Path, packing: Packing, state: State) -> None:

@@ -188,9 +188,8 @@ def population_packing(
             break
         z[wrong] = rng.standard_normal((int(wrong.sum()), own.size))
     else:
-        raise InputError(
-            f"{REDRAWS} draws of a particle's law, none monotone", remedy="The calibrated scatter is too large."
-        )
+        problem = f"{REDRAWS} draws of a particle's law, none monotone"
+        raise InputError(problem, remedy="The calibrated scatter is too large.")
     kept = jnp.asarray(z)
 
     def packing_of(values: Array) -> Packing:
@@ -273,10 +272,8 @@ def fit_compaction(
     values, heights = arguments.path(start, "start"), arguments.path(heights, "heights")
     measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")
     if measured.shape != np.shape(heights) or measured.size < len(values) or not np.isfinite(measured).all():
-        raise InputError(
-            f"{measured.size} forces for {len(heights)} heights and {len(values)} parameters",
-            remedy="One finite force for each height, and no fewer than parameters.",
-        )
+        problem = f"{measured.size} forces for {len(heights)} heights and {len(values)} parameters"
+        raise InputError(problem, remedy="One finite force for each height, and no fewer than parameters.")
     if not measured.max() > 0:
         raise InputError("a compaction curve without a positive force", remedy="Forces are in newtons.")
     target, stays, rounds = jnp.asarray(measured), False, 0

@@ -12,7 +12,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._numerics import recompute
-from .._types import Scalar, scalar
+from .._types import Scalar, checked, scalar
 
 Vector = Float[Array, " 3"]
 
@@ -66,16 +66,14 @@ class Cylinder(eqx.Module):
     whole in friction.
     """
 
-    radius: Scalar = eqx.field(converter=scalar)
+    radius: Scalar = eqx.field(converter=checked(arguments.positive, "the radius of a cylinder [m]"))
     rim: Scalar = eqx.field(converter=scalar)
-    chamfer: Scalar = eqx.field(converter=scalar)
+    chamfer: Scalar = eqx.field(converter=checked(arguments.positive, "chamfer", zero=True))
     velocity: Vector = eqx.field(converter=_vector)
 
     __repr__ = described(radius="m", rim="m", velocity="m/s")
 
     def __check_init__(self) -> None:
-        arguments.positive(self.radius, "the radius of a cylinder [m]")
-        arguments.positive(self.chamfer, "chamfer", zero=True)
         if not (arguments.is_traced(self.rim) or self.rim > -jnp.inf):
             raise InputError(f"rim must be a height [m], or infinite for none; got {float(self.rim):g}")
 
@@ -113,7 +111,5 @@ def set_velocity(walls: Walls, velocity: Any) -> Walls:
     velocity = arguments.values(velocity, "velocity", shape="three components [m/s] for every wall")
     if velocity.shape != (len(walls), 3):
         raise InputError(f"velocity has the shape {velocity.shape} where ({len(walls)}, 3) is expected")
-    return tuple(
-        eqx.tree_at(lambda w: w.velocity, wall, v.astype(wall.velocity.dtype))
-        for wall, v in zip(walls, velocity, strict=True)
-    )
+    pairs = zip(walls, velocity, strict=True)
+    return tuple(eqx.tree_at(lambda w: w.velocity, wall, v.astype(wall.velocity.dtype)) for wall, v in pairs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -76,22 +76,21 @@ def _rendered(template: str, law: MccLaw, particle: Particle, origin: Origin) ->
     )
 
 
-def _origin_lines(law: MccLaw, particle: Particle, origin: Origin) -> list[str]:
-    lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
+def _origin_lines(law: MccLaw, particle: Particle, origin: Origin) -> Iterator[str]:
+    yield f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."
     for one in effects_of(law):
         values = ", ".join(f"{name} = {value:.6g}" for name, value in one["numbers"].items())
-        lines.append(_quoted(f"Effect {one['name']}: {one['equation']}; {values}.")[1:-1])
+        yield _quoted(f"Effect {one['name']}: {one['equation']}; {values}.")[1:-1]
     if c := origin.calibration:
-        lines.append(f"From {_quoted(c['file'])}, method {_quoted(c['method'])}, sha256 {str(c['sha256'])[:16]}...")
+        yield f"From {_quoted(c['file'])}, method {_quoted(c['method'])}, sha256 {str(c['sha256'])[:16]}..."
         if not c["converged"]:
-            lines.append("WARNING: that calibration did not converge.")
+            yield "WARNING: that calibration did not converge."
     whose = "the population (medians)" if origin.particle is None else f"particle {_quoted(origin.particle)}"
-    lines.append(f"Coefficients of {whose}.")
+    yield f"Coefficients of {whose}."
     sizes = ", ".join(f"{float(d):.6g}" for d in jax.tree.leaves(particle))
-    lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)}).")
+    yield f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)})."
     if not bool(law.is_monotone):
-        lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
-    return lines
+        yield "WARNING: the loading curve is not monotone; a pair of such contacts has several solutions."
 
 
 def _quoted(text: str) -> str:
@@ -167,10 +166,9 @@ def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> t
                 elif name in _OPERATIONS and not kind.ndim:
                     expression = _OPERATIONS[name].format(*results)
                 else:
-                    raise InputError(
-                        f"an effect of this law takes the operation {name}, which has no counterpart in C",
-                        remedy="Export the law as a JAX artefact (--format jax), or leave that effect out.",
-                    )
+                    problem = f"an effect of this law takes the operation {name}, which has no counterpart in C"
+                    remedy = "Export the law as a JAX artefact (--format jax), or leave that effect out."
+                    raise InputError(problem, remedy=remedy)
                 results = [f"t{len(statements)}"]
                 statements.append(("int" if kind.dtype.kind == "b" else "double", results[0], expression))
             known.update(zip(equation.outvars, results, strict=True))

@@ -25,8 +25,7 @@ from ..effects import LIBRARY
 from ..geometry import Particle
 from ..law import MccLaw
 
-HUGE = 1e44
-"""Above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite."""
+HUGE = 1e44  # above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite
 _AGAIN = "Give a folder that mcc-jax calibrate or discover wrote, or calibrate again"
 _FALLING = "the loading curve is not monotone (9 C3^6 > 20 C1 C5^5): stress falls over part of the loading"
 
@@ -90,10 +89,8 @@ def check(law: MccLaw, particle: Particle, *, monotone: bool = False) -> None:
         raise InputError(f"the law is not usable: {numbers(law)}", remedy=remedy)
     if not bool(law.carries_stress(particle)):
         sizes, eta = ", ".join(f"{float(d):g}" for d in jax.tree.leaves(particle)), float(law.shape_factor(particle))
-        raise InputError(
-            f"the shape factor of a particle of {sizes} um is {eta:.4g} with a = {float(law.a):.4g}",
-            remedy="Give --diameters of a rounder particle: shape factors must be positive",
-        )
+        problem = f"the shape factor of a particle of {sizes} um is {eta:.4g} with a = {float(law.a):.4g}"
+        raise InputError(problem, remedy="Give --diameters of a rounder particle: shape factors must be positive")
     if monotone and not bool(law.is_monotone):
         remedy = "Take the population or another particle, or give --allow-not-monotone to export it as it is"
         raise InputError(_FALLING, remedy=remedy)

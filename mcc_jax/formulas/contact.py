@@ -34,9 +34,6 @@ HALLEY_STEPS = 4  # meet the last digit in every case tried: k3 = 0, loss of mon
 Flags = Bool[Array, "..."]
 
 
-# ---- loading ---------------------------------------------------------------------------------------------------------
-
-
 class Quintic(eqx.Module):
     """:math:`k_1 x - k_3 x^3 + k_5 x^5`, force against displacement or stress against scaled strain.
 

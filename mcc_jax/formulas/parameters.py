@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 
 from .._format import described, in_words, table
 from .._numerics import compiled_whole, cotangent_barrier, recompute
-from .._types import Flag, Scalar, ScalarLike, Values, scalar
+from .._types import Flag, Scalar, ScalarLike, Values, checked, scalar
 from ..arguments import finite, member, positive
 from ..geometry import Particle, plastic_shape_factor
 from .contact import Contact, Quintic, reached, stress_ratio
@@ -22,16 +21,6 @@ from .contact import Contact, Quintic, reached, stress_ratio
 AREA = 1e-3 * jnp.pi / 4  # effective area over the diameter squared, times what makes mN of MPa um^2
 PUNCH_AREA = 1.43
 """c^2 of Storakers for perfect plasticity. It equals the paper's `a` by coincidence: never share one constant."""
-
-
-def checked(check: Callable[..., None], name: str, **options: bool) -> Callable[[ScalarLike], Scalar]:
-    """The converter of a number of the law, which refuses a plain number that a check of `arguments` refuses."""
-
-    def convert(value: ScalarLike) -> Scalar:
-        check(value, name, **options)
-        return scalar(value)
-
-    return convert
 
 
 class Plastic(eqx.Module):
@@ -247,8 +236,6 @@ class Formulas(eqx.Module):
         secant = jnp.where(moved, peak_force, contact.k1) / jnp.where(moved, peak, 1.0)
         return jnp.where(moved, contact.softened(factor).recovered(peak, secant).displacement, 0.0)
 
-
-# ---- the four numbers of a contact from law and size -----------------------------------------------------------------
 
 # Of unloading, of the shape factor, and A / L^2, which turns MPa and the unit of length into the unit of force.
 Form = tuple[Unloading, StrainScaling, float]

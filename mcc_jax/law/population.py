@@ -9,10 +9,9 @@ from jax.scipy.stats import norm
 from jaxtyping import PRNGKeyArray
 
 from .._format import described
-from .._types import Scalar, Values
+from .._types import Scalar, Values, checked
 from ..arguments import finite, positive, whole
 from ..formulas import Plastic
-from ..formulas.parameters import checked
 
 
 class LogNormal(eqx.Module):

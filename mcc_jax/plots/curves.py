@@ -35,9 +35,6 @@ _RELEASED = Line2D([], [], color=UNLOADING, label="unloading, reloading", **_DOT
 _NOT_USED = Line2D([], [], color=style.PALE, label="not used", **_DOT)
 
 
-# ---- measured and calibrated -----------------------------------------------------------------------------------------
-
-
 def segments(kind: np.ndarray) -> list[np.ndarray]:
     """Rows of every segment."""
     return np.split(np.arange(len(kind)), np.flatnonzero(np.diff(kind)) + 1)
@@ -171,12 +168,8 @@ def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
         raise InputError(f"there is no page {page}; there are {pages}, counted from 1")
     chosen = range((page - 1) * PAGE, min(page * PAGE, count))
     figure = _draw_particles(calibration, chosen)
-    handles = [
-        _MEASURED,
-        _RELEASED,
-        Line2D([], [], color=style.GREEN, linewidth=1.6, label="mean law"),
-        Line2D([], [], color=style.BLACK, linewidth=0.8, label="own coefficients"),
-    ]
+    handles = [_MEASURED, _RELEASED, Line2D([], [], color=style.GREEN, linewidth=1.6, label="mean law")]
+    handles.append(Line2D([], [], color=style.BLACK, linewidth=0.8, label="own coefficients"))
     if any(calibration.curves[i].why_not for i in chosen):
         handles.append(_NOT_USED)
     title = "Measured and predicted" + (f", page {page} of {pages}" if pages > 1 else "")

@@ -33,9 +33,6 @@ def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     return figures
 
 
-# ---- raw and adjusted curves -----------------------------------------------------------------------------------------
-
-
 def adjusted_curve(calibration: PaperCalibration, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Strain [-] and stress [MPa] of a whole kept test after an offset step, with its line up to the threshold."""
     campaign, adjustment = calibration.campaign, calibration.adjustment
@@ -94,9 +91,6 @@ def plot_curves(calibration: PaperCalibration) -> Figure:
     return style.finish(figure, campaign)
 
 
-# ---- dimensions ------------------------------------------------------------------------------------------------------
-
-
 @style.styled
 def plot_dimensions(campaign: Campaign) -> Figure:
     """Effective diameter D_e = D1 D2 / D3 over average diameter (D1 + D2 + D3)/3 [um], one point per particle.
@@ -129,9 +123,6 @@ def plot_dimensions(campaign: Campaign) -> Figure:
         lines.append(f"correlation: {np.corrcoef(average, effective)[0, 1]:.2f}")
     style.note(ax, "\n".join(lines), place="lower right")
     return style.finish(figure, campaign)
-
-
-# ---- shape factor, master curve, law ---------------------------------------------------------------------------------
 
 
 @style.styled
@@ -259,9 +250,6 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     if calibration.plastic.at_bound:
         style.note(ax, "at its lower bound:\n" + "\n".join(calibration.plastic.at_bound), place="lower right")
     return style.finish(figure, calibration.campaign)
-
-
-# ---- unloading, residuals --------------------------------------------------------------------------------------------
 
 
 @style.styled

@@ -59,9 +59,6 @@ def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
     return style.by_stem((plot_whitened, plot_fits, plot_estimates), calibration)
 
 
-# ---- the population --------------------------------------------------------------------------------------------------
-
-
 def _scaled(named: dict[str, Any]) -> dict[str, Any]:
     """Draws in the order and the units of the figures."""
     return {name: named[name] * (1e-3 if name.endswith("_MPa") else 1.0) for name in LABELS if name in named}
@@ -184,9 +181,6 @@ def prior_near(prior: np.ndarray, end: float) -> np.ndarray:
     """Draws of a prior up to where the posterior ends: it may pile up at 0 far within one kernel of all draws."""
     near = prior[prior <= 2 * end]
     return near if len(near) >= NEAR_DRAWS else prior
-
-
-# ---- the particles ---------------------------------------------------------------------------------------------------
 
 
 def draw_forest(

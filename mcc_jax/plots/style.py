@@ -45,7 +45,6 @@ SMALL = 7.5
 RC: dict[Any, Any] = {
     "font.family": FONT,
     "font.size": 9.0,
-    "axes.labelsize": 9.0,
     "axes.titlesize": 9.0,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
@@ -81,9 +80,6 @@ def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: i
     return list(files)
 
 
-# ---- text from outside -----------------------------------------------------------------------------------------------
-
-
 def plain(text: str, longest: int = 24) -> str:
     """Any text as one short line that matplotlib draws literally, and as well as its font can."""
     font = get_font(findfont(FONT))
@@ -101,9 +97,6 @@ def particle_labels(names: Sequence[str], longest: int = 24) -> list[str]:
     ambiguous = {label for label, count in Counter(labels).items() if count > 1 or "\N{REPLACEMENT CHARACTER}" in label}
     ambiguous.add("")
     return [f"{label} (no. {i})".strip() if label in ambiguous else label for i, label in enumerate(labels, start=1)]
-
-
-# ---- layout ----------------------------------------------------------------------------------------------------------
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

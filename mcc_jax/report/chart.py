@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from importlib.resources import files
 from typing import Any
@@ -24,6 +25,7 @@ LOOKS = {
 """Marker, colour (Okabe and Ito) and word of every kind of segment: never distinguished by colour alone."""
 
 COLUMNS = ("displacement", "force", "residual", "marker", "colour", "alpha", "particle", "segment", "time", "compared")
+DECIMALS = {"time_s": 4, "force_mN": 5, "displacement_um": 6, "own_um": 6, "typical_um": 4, "low_um": 6, "high_um": 6}
 LOADED_FROM = re.compile(r"https://(?:cdn\.jsdelivr\.net|maps\.googleapis\.com)/[^\"'`\\\s]*")
 """What Bokeh's script would load from elsewhere: MathJax, icons and maps, none of which the page uses."""
 POINTS = 40_000  # about so many in all, shared among the particles: they make a page of 3 MB that still scrolls
@@ -131,7 +133,7 @@ def _figure(name: str, across: str, up: str) -> Any:
     return plot
 
 
-def chart(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict[str, Any]:
+def chart(shown: list[FittedCurve], labels: list[str], facts: Iterable[str]) -> dict[str, Any]:
     """What the page's script needs: Bokeh's empty figures, every particle's columns, how kinds of segments look."""
     data = {
         "kinds": [dict(zip(("marker", "colour", "word"), LOOKS[kind], strict=True)) for kind in KINDS],
@@ -139,13 +141,7 @@ def chart(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict
             {
                 "label": label,
                 "facts": fact,
-                "time": _rounded(one.time_s, 4),
-                "force": _rounded(one.force_mN, 5),
-                "displacement": _rounded(one.displacement_um, 6),
-                "own": _rounded(one.own_um, 6),
-                "typical": _rounded(one.typical_um, 4),
-                "low": _rounded(one.low_um, 6),
-                "high": _rounded(one.high_um, 6),
+                **{name.partition("_")[0]: _rounded(getattr(one, name), digits) for name, digits in DECIMALS.items()},
                 "kind": one.kind.tolist(),
                 "used": one.used.astype(int).tolist(),
             }

@@ -19,8 +19,7 @@ from ..discovery.sentences import NOTHING_MISSING, headline, verdict_in_words, w
 from .read import CALIBRATION, DATA, Results
 
 Level = Literal["good", "look", "bad", "unknown"]
-RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
-"""From here on the gate is not just missed: the draws cannot be used."""
+RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0  # from here on the gate is not just missed: the draws cannot be used
 
 GOOD_MISFIT = 0.01
 GOOD_NOISE_SHARE = 0.2

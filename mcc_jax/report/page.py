@@ -132,7 +132,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "chart": chart(shown, labels, texts.particle_facts(results, shown)) if shown else None,
         "bokeh": Markup(chart_scripts()) if shown else "",
         "checks": checks,
-        "changes": [] if results.discovery is None else texts.changes(results.discovery),
+        "changes": [] if results.discovery is None else list(texts.changes(results.discovery)),
         "figures_of": _figures(results),
         "law": results.law,
         "law_alone": results.law_alone,

@@ -63,9 +63,6 @@ class Example:
             width *= 1.5
 
 
-# ---- which test ------------------------------------------------------------------------------------------------------
-
-
 def example_of(results: Results, shown: Sequence[FittedCurve]) -> Example | None:
     """The test to show: of a discovery the one whose gap closes most, else the one that the law fits worst."""
     example = None if results.found is None else most_informative_test(results.found)
@@ -119,9 +116,6 @@ def most_informative_test(found: Discovery) -> Example | None:
         f"law with {name}" if added else "",
         campaign.metadata.simulated,
     )
-
-
-# ---- its pictures ----------------------------------------------------------------------------------------------------
 
 
 @context(["default", RC, {"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}])  # equal pages; text stays text
@@ -208,9 +202,6 @@ def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, 
 def data_uri(picture: bytes, kind: str = "png") -> str:
     """A picture as part of the page."""
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
-
-
-# ---- the words -------------------------------------------------------------------------------------------------------
 
 
 def cards(found: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:

@@ -58,9 +58,6 @@ def equation(text: str) -> Markup:
     return Markup(written)
 
 
-# ---- sentences -------------------------------------------------------------------------------------------------------
-
-
 def calibration_sentences(content: dict[str, Any], law: str = "the law") -> Iterator[str]:
     """A `calibration.json` in a few sentences; of the law "alone", which lacks something, no numbers are shown."""
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
@@ -152,9 +149,6 @@ def spread(log: dict[str, Any]) -> str:
     return f"How much particles differ: two of three lie between {low} and {high}."
 
 
-# ---- tables ----------------------------------------------------------------------------------------------------------
-
-
 def measured(campaign: Campaign) -> list[tuple[str, str]]:
     """Facts of a campaign, name and value."""
     sizes, meta = campaign.diameters_um, campaign.metadata
@@ -182,26 +176,23 @@ def measured(campaign: Campaign) -> list[tuple[str, str]]:
     ]
 
 
-def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
+def changes(found: dict[str, Any]) -> Iterator[tuple[str, list[tuple[str, str | None]]]]:
     """What a discovery did to the parameters: name, and before and after the value with its error, and its interval."""
     before, after = (
         {one.name: one for one in quantities(side) if one.estimate["value"] is not None} if side else {}
         for side in (found["parameters_before"], found["parameters_after"])
     )
-    rows = []
     for name in before:
         if name in after and not name.endswith("_sd_of_log"):
             first = before[name]
             label = f"{first.label} [{first.unit}]" if first.unit else first.label
             both = (first, after[name])
-            rows.append((label, [(with_sd(q.estimate, q.factor), interval(q.estimate, q.factor)) for q in both]))
-    return rows
+            yield label, [(with_sd(q.estimate, q.factor), interval(q.estimate, q.factor)) for q in both]
 
 
-def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
+def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> Iterator[str]:
     """One line about each particle, for the line below the chart."""
     rows = {name: (diameters, entry) for name, diameters, _, entry in particle_rows(results)}
-    facts = []
     for one in shown:
         diameters, entry = rows[one.name]
         parts = [f"D₁ × D₂ × D₃ = {' × '.join(map(number, diameters))}\N{NO-BREAK SPACE}µm"]
@@ -211,8 +202,7 @@ def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
             parts.append(f"not used: {one.why_not}")
         elif one.rms_um is not None:
             parts.append(f"root mean square of test − law {number(one.rms_um, 2)}\N{NO-BREAK SPACE}µm")
-        facts.append("; ".join(parts) + ".")
-    return facts
+        yield "; ".join(parts) + "."
 
 
 def particle_rows(results: Results) -> list[tuple[str, Any, Any, Any]]:

@@ -34,8 +34,7 @@ from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, 
 from .drive import refusal, simulate_batch
 from .programme import Instrument, Programme
 
-_STREAM = 0x0EFF_EC75
-"""Separates the draws of effects from those of noise, coefficients and peaks."""
+_STREAM = 0x0EFF_EC75  # separates the draws of effects from those of noise, coefficients and peaks
 
 
 @dataclass(frozen=True)
@@ -309,8 +308,7 @@ def paper_campaign(
         shared_material: give every particle the mean law instead of a draw.
         instrument: read-out; 0.02 um and 0.05 mN of noise if None.
         programme: what the instrument does; one cycle at 2 mN/s if None.
-        unloading: form of the unloading law (16 GPa belongs to the printed one).
-        strain_scaling: how the shape factor enters unloading.
+        unloading, strain_scaling: as of `MccLaw`; 16 GPa belongs to the printed form.
         effects, relative_humidity_percent: as of `simulate_campaign`.
     """
     seed = arguments.seed(seed)

@@ -93,10 +93,9 @@ def refusal(law: AbstractContactLaw, particle: Particle, response: Response, nam
         return InputError(f"{name}: {RESULTS[response.result]}")
     names = ", ".join(e.name for e in getattr(law, "effects", ()) if isinstance(e, AbstractModulusAtPeak))
     beyond = f"loaded beyond a strain of {float(law.gain_strain(particle, response.state)):.2g}"
-    return InputError(
-        f"with {names or 'its law'} {name}, {beyond} and released, would give back more energy than that took",
-        remedy="Take a smaller amplitude, a stiffer effective modulus, or a path that ends below that strain.",
-    )
+    problem = f"with {names or 'its law'} {name}, {beyond} and released, would give back more energy than that took"
+    remedy = "Take a smaller amplitude, a stiffer effective modulus, or a path that ends below that strain."
+    return InputError(problem, remedy=remedy)
 
 
 @eqx.filter_jit
@@ -134,8 +133,7 @@ def simulate_batch(
     cannot drive it marks in `result`.
 
     Args:
-        laws: a law whose every array field has a leading axis N.
-        particles: a particle, likewise.
+        laws, particles: a law and a particle whose every array field has a leading axis N.
         paths: displacements [um] or forces [mN], shape (N, steps); pad shorter paths by repeating their last value.
         times: times [s], likewise, for laws with effects.
         relative_humidity: of every test [%], shape (N,), for laws with effects; the reference if None.

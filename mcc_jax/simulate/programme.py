@@ -99,12 +99,11 @@ class Programme:
         """Load to each level in turn and unload after each; the last unloading is complete.
 
         Args:
-            control: controlled quantity.
             rate: of all ramps [mN/s or um/s]; the paper's tests ran at 2 mN/s, which it calls a stress rate.
             levels: shares of the particle's peak, one per cycle.
             unload_to: share of the peak at which reloading starts.
             hold_s: hold at every level.
-            interval_s, points: as of `Programme`; 300 points if neither is given.
+            control, interval_s, points: as of `Programme`; 300 points if neither is given.
         """
         levels = arguments.floats(levels, "levels", shape="a list of shares of the peak").ravel().tolist()
         hold_s = arguments.number(hold_s, "hold_s", least=0)

@@ -40,8 +40,7 @@ def read(lines: list[str], file: Path) -> Tests:
         if head is None:
             raise cut_off(f"the test {name!r} has no samples (the line F h t is missing)", file, start + 1)
         end = next((i for i in range(head + 1, stop) if not lines[i].strip() or ".hap" in lines[i]), stop)
-        last = starts[-1] == start
-        if any(line.strip() for line in lines[end:stop]) and last:
+        if start == starts[-1] and any(line.strip() for line in lines[end:stop]):
             raise cut_off("there is text behind the last test's samples", file, end + 1)
         at = range(head + 1, end)
         columns = number_block(lines, at, _COLUMNS.split("\t"), file, decimal_mark=",")

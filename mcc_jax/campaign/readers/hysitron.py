@@ -8,7 +8,6 @@ the curve is kept in `Metadata.other`.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ def is_hld(lines: list[str]) -> bool:
 def read_hld(lines: list[str], file: Path) -> Tests:
     """The test of a `.hld`. Raises `InputError` if a block is missing, cut off or damaged."""
     blocks: dict[str, dict[str, np.ndarray]] = {}
-    at: Sequence[int] = ()
+    places: dict[str, range] = {}
     header: list[tuple[str, str]] = []
     i = 0
     while i < len(lines):
@@ -52,13 +51,12 @@ def read_hld(lines: list[str], file: Path) -> Tests:
             raise cut_off(f"{match[1]} announces {count} rows, the file ends before", file, i + 1)
         if match[1] in blocks:
             raise cut_off(f"the block '{match[1]} Data Points' appears twice", file, i + 1)
-        blocks[match[1]] = number_block(lines, range(i + 2, stop), names, file)
-        if match[1] == "Test":
-            at = range(i + 2, stop)
+        places[match[1]] = range(i + 2, stop)
+        blocks[match[1]] = number_block(lines, places[match[1]], names, file)
         i = stop
     if "Test" not in blocks:
         raise cut_off("the block 'Test Data Points' is missing", file)
-    test = blocks.pop("Test")
+    test, at = blocks.pop("Test"), places["Test"]
     force_name = next((name for name in _FORCES if name in test), _FORCES[0])
     for name in ("Time_s", "Disp_nm", force_name):
         if name not in test:

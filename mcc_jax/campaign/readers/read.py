@@ -63,8 +63,7 @@ def read_instrument_file(
             problem = "cannot differ between mapping files"
             raise InputError(problem, file=one.file, column="diameters_um", remedy="Give --diameters")
         if place.is_dir() and one.test_name is not None:
-            problem = "is for one file, not for a folder"
-            raise InputError(problem, file=one.file, column="test_name", remedy="Remove it")
+            raise InputError("is for one file, not for a folder", file=one.file, column="test_name", remedy="Remove it")
         if diameters_um is None and (sizes := one.diameters_um) is not None:
             diameters_um = sizes["all"] if list(sizes) == ["all"] else sizes
 
@@ -113,8 +112,7 @@ def _read_known(data: bytes, file: Path) -> Tests:
     for matches, read in FORMATS.values():
         if matches(lines):
             return read(lines, file)
-    problem = f"the format is not known (known: {', '.join(FORMATS)})"
-    raise InputError(problem, file=file, remedy=_HOW)
+    raise InputError(f"the format is not known (known: {', '.join(FORMATS)})", file=file, remedy=_HOW)
 
 
 def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Tests:
@@ -143,8 +141,6 @@ def _content(tests: Tests) -> tuple[Any, ...]:
     sizes = {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
     return readings, sizes, tests.control
 
-
-# ---- diameters, which instrument files do not hold -------------------------------------------------------------------
 
 _SIZES = (
     "Give --diameters D1,D2,D3 in um for all, or --diameters FILE, a CSV or xlsx table with particle,D1_um,D2_um,D3_um"
@@ -182,10 +178,8 @@ def diameters_for(
     `keys` holds, by the name of each test, the names under which a table may hold its diameters, the best first."""
     if diameters is not None and not isinstance(diameters, Mapping):
         return np.tile(arguments.one_particle(diameters), (len(keys), 1)), 0
-    table = {
-        same_text(name): arguments.one_particle(triple, f"diameters of {name!r}")
-        for name, triple in (diameters or {}).items()
-    }
+    given = (diameters or {}).items()
+    table = {same_text(name): arguments.one_particle(triple, f"diameters of {name!r}") for name, triple in given}
     found: list[Triple] = []
     used: set[str] = set()
     lacking: dict[str, InputError | None] = {}
