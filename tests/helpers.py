@@ -67,6 +67,21 @@ def refusal(read, *args, **kwargs):
     return str(caught.value)
 
 
+def assert_holds(text, pieces):
+    """Every piece is in the text."""
+    missing = [piece for piece in pieces if piece not in text]
+    assert not missing, (missing, text)
+
+
+def assert_same_curves(found, expected):
+    """Readings are equal to the last bit, signs of zero included."""
+    for one, two in zip(found, expected, strict=True):
+        for name in ("time_s", "force_mN", "displacement_um"):
+            x, y = getattr(one, name), getattr(two, name)
+            np.testing.assert_array_equal(x, y)
+            np.testing.assert_array_equal(np.signbit(x), np.signbit(y))
+
+
 def all_finite(tree):
     return all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(tree))
 
