@@ -13,6 +13,7 @@ import pytest
 
 from mcc_jax import InputError
 from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM, PAPER_LOG_C
+from mcc_jax.effects import AbstractModulusAtPeak
 from mcc_jax.geometry import Particle
 from mcc_jax.law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 
@@ -112,6 +113,13 @@ def paper_population():
 
 def with_dtype(tree, dtype):
     return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
+class Softer(AbstractModulusAtPeak):
+    """A user's own: E / (1 + kappa eps_P sigma_P)."""
+
+    def factor(self, strain, stress):
+        return 1 / (1 + self.amplitude * jnp.maximum(strain, 0.0) ** 2 * jnp.sqrt(stress))
 
 
 # ---- the law, compiled once for all tests of a file ------------------------------------------------------------------

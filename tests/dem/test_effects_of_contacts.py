@@ -5,12 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import Softer
 from test_pair_law import ON_PATH, PARTICLE, UM, cycle, driven, law_of, on_pair, on_wall, with_all
 
 from benchmarks import energy_paths
 from mcc_jax import InputError, Particle, Unloading, drive
 from mcc_jax.dem import half_contact, pair_recovery, spheres, wall_energy, wall_force
-from mcc_jax.effects import LIBRARY, AbstractEffect, AbstractModulusAtPeak, find_variant
+from mcc_jax.effects import LIBRARY, AbstractEffect, find_variant
 from mcc_jax.law import StrainScaling
 
 CLOSED = [v for m in ("damage", "densification_stiffening", "size_effect", "shape_second_order") for v in LIBRARY[m]]
@@ -133,13 +134,6 @@ def test_everything_else_is_refused_by_name(variant):
         half_contact(law, PARTICLE)
     rest = law.of_particle() if effect.of_instrument else law.without_effects(variant.label)
     assert eqx.tree_equal(half_contact(rest, PARTICLE), half_contact(law_of(), PARTICLE))
-
-
-class Softer(AbstractModulusAtPeak):
-    """A user's own formula of the peak."""
-
-    def factor(self, strain, stress):
-        return 1 / (1 + self.amplitude * strain * stress)
 
 
 class Anyhow(AbstractEffect):
