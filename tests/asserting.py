@@ -22,3 +22,8 @@ def refused(result):
     assert "Traceback" not in result.stderr
     assert result.stderr.strip().isprintable()
     return result.stderr.strip()
+
+
+def estimate(value, sd=None):
+    """An estimate as results state it."""
+    return {"value": value, "sd": sd, "interval_95": None if sd is None else [value - 1.96 * sd, value + 1.96 * sd]}

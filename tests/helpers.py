@@ -13,6 +13,7 @@ import pytest
 
 from mcc_jax import InputError
 from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM, PAPER_LOG_C
+from mcc_jax.effects import AbstractModulusAtPeak
 from mcc_jax.geometry import Particle
 from mcc_jax.law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 
@@ -67,6 +68,21 @@ def refusal(read, *args, **kwargs):
     return str(caught.value)
 
 
+def assert_holds(text, pieces):
+    """Every piece is in the text."""
+    missing = [piece for piece in pieces if piece not in text]
+    assert not missing, (missing, text)
+
+
+def assert_same_curves(found, expected):
+    """Readings are equal to the last bit, signs of zero included."""
+    for one, two in zip(found, expected, strict=True):
+        for name in ("time_s", "force_mN", "displacement_um"):
+            x, y = getattr(one, name), getattr(two, name)
+            np.testing.assert_array_equal(x, y)
+            np.testing.assert_array_equal(np.signbit(x), np.signbit(y))
+
+
 def all_finite(tree):
     return all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(tree))
 
@@ -97,6 +113,13 @@ def paper_population():
 
 def with_dtype(tree, dtype):
     return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
+class Softer(AbstractModulusAtPeak):
+    """A user's own: E / (1 + kappa eps_P sigma_P)."""
+
+    def factor(self, strain, stress):
+        return 1 / (1 + self.amplitude * jnp.maximum(strain, 0.0) ** 2 * jnp.sqrt(stress))
 
 
 # ---- the law, compiled once for all tests of a file ------------------------------------------------------------------

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax import Instrument, Plastic, Programme, Unloading, simulate_campaign
+from mcc_jax import Instrument, Plastic, Programme, Unloading, paper_campaign, simulate_campaign
 from mcc_jax.calibrate.data import Tests, select_tests
 from mcc_jax.calibrate.forward import Linear, Straight
 from mcc_jax.calibrate.marginal import Marginal
@@ -62,6 +62,11 @@ def simulated(
     return simulate_campaign(
         laws, np.asarray(diameters), peaks, programme, instrument=instrument, particles=particles, seed=seed, **more
     )
+
+
+def eight_particles():
+    """Those of the paper that come first."""
+    return paper_campaign(0, instrument=NOISE).select(np.arange(20) < 8)
 
 
 def five_particles(seed=0):

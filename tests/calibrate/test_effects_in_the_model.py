@@ -20,14 +20,14 @@ pytestmark = pytest.mark.extended
 CREEP, AMPLITUDE, TAU_S = "creep:logarithmic", 2e-4, 3.0
 
 
-def creeping(tau_s):
+def creeping(tau_s, amplitude=AMPLITUDE, noise_um=0.08):
     """Eight particles that creep, loaded twice with a hold at each peak; as long as those of other modules.
 
     The law without effects is then compiled once for all.
     """
     programme = mcc.Programme.cycles(levels=(0.5, 1.0), hold_s=10.0, points=240)
-    hidden = mcc.HiddenEffect(find_variant(CREEP), AMPLITUDE, {"tau_s": tau_s})
-    instrument = mcc.Instrument(displacement_noise_um=0.08, force_noise_mN=0.05)
+    hidden = mcc.HiddenEffect(find_variant(CREEP), amplitude, {"tau_s": tau_s})
+    instrument = mcc.Instrument(displacement_noise_um=noise_um, force_noise_mN=0.05)
     whole = mcc.paper_campaign(0, programme=programme, instrument=instrument, effects=[hidden])
     return whole.without(*whole.particles[8:])
 
@@ -94,10 +94,8 @@ def test_tests_bend_with_the_effects_numbers(posterior):
 
 def test_creep_beyond_the_record_is_drawn_as_widely_as_tests_leave_it_open():
     """Amplitude over time is known, the time is not: a ridge over a decade, without a divergence."""
-    far = mcc.HiddenEffect(find_variant(CREEP), 100 * AMPLITUDE, {"tau_s": 1000.0})
-    programme = mcc.Programme.cycles(levels=(0.5, 1.0), hold_s=10.0, points=240)
-    hidden = mcc.paper_campaign(0, programme=programme, effects=[far])
-    posterior = mcc.sample(hidden.without(*hidden.particles[8:]), mcc.Model().with_effects(CREEP), seed=0)
+    far = creeping(1000.0, 100 * AMPLITUDE, 0.02)
+    posterior = mcc.sample(far, mcc.Model().with_effects(CREEP), seed=0)
     named = posterior.named_population()
     for name, truth in (("creep", 100 * AMPLITUDE), ("creep.tau_s", 1000.0), ("effective_modulus_MPa", 16_000.0)):
         low, high = np.quantile(named[name], [0.005, 0.995])

@@ -5,6 +5,7 @@ import functools
 import faulty
 import numpy as np
 import pytest
+from asserting import estimate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -125,12 +126,7 @@ def test_what_is_like_the_others_or_has_none_to_be_unlike(monkeypatch):
 
 
 def answer(value=16000.0, sd=40.0, *, converged=True):
-    interval = None if sd is None else [value - 1.96 * sd, value + 1.96 * sd]
-    return {
-        "converged": converged,
-        "a": {"value": 1.43, "sd": 0.01, "interval_95": [1.41, 1.45]},
-        "effective_modulus_MPa": {"value": value, "sd": sd, "interval_95": interval},
-    }
+    return {"converged": converged, "a": estimate(1.43, 0.01), "effective_modulus_MPa": estimate(value, sd)}
 
 
 @pytest.mark.extended

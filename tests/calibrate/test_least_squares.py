@@ -1,29 +1,22 @@
 """Joint least squares: what it recovers, what it calls open, and SciPy on the same residuals."""
 
 import json
-from dataclasses import replace
 
+import faulty
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from joint_cases import NOISE, simulated, true_coefficients
+from joint_cases import eight_particles, true_coefficients
 from scipy.optimize import least_squares as scipy_least_squares
 
-from mcc_jax import Curve, Programme, least_squares, paper_campaign
+from mcc_jax import least_squares
 from mcc_jax.calibrate.pooled_fit import Parameters, minimise, pooled_residual, robust
-
-# Eight particles in every test: one compilation.
-KEEP = np.arange(20) < 8
-
-
-def campaign_of(instrument=NOISE):
-    return paper_campaign(0, instrument=instrument).select(KEEP)
 
 
 @pytest.fixture(scope="module")
 def result():
-    return least_squares(campaign_of())
+    return least_squares(eight_particles())
 
 
 @pytest.fixture(scope="module")
@@ -152,37 +145,20 @@ def test_a_parameter_without_data_stays_where_it_is(max_steps):
         assert np.all(np.isfinite(np.asarray(block)))
 
 
-@pytest.mark.extended
-def test_particles_of_one_shape_leave_the_shape_parameter_open():
-    """a and the means of log C can then make up for each other."""
-    same = np.array([170.0, 180.0, 140.0]) * np.linspace(0.8, 1.2, 8)[:, None]
-    C = true_coefficients(campaign_of())
-    found = least_squares(simulated(C, same, programme=Programme.cycles(points=300), instrument=NOISE))
-    content = json.loads(json.dumps(found.to_json(), allow_nan=False))
-    assert content["diagnostics"]["open_combinations"]
-    assert "a" in content["diagnostics"]["open_combinations"][0]
-    assert content["a"]["sd"] is None
-    assert any("open" in note for note in content["warnings"])
-    # What the curves do say stays: the modulus enters without the shape factor here.
-    modulus = content["effective_modulus_MPa"]
-    assert abs(modulus["value"] - 16_000) < 5 * modulus["sd"]
-
-
 # ---- robust losses ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def with_outliers():
-    campaign = campaign_of()
     rng = np.random.default_rng(5)
-    curves = []
-    for curve in campaign.curves:
+
+    def displaced(time, force, path):
         # Four at a time: one or two far readings are spikes, which never reach the fit.
-        groups = -(-len(curve) // 4)
+        groups = -(-len(path) // 4)
         away = np.where(rng.random(groups) < 0.05, 5.0 * rng.choice([-1.0, 1.0], groups), 0.0)
-        displaced = curve.displacement_um + np.repeat(away, 4)[: len(curve)]
-        curves.append(Curve(curve.time_s, curve.force_mN, displaced))
-    return replace(campaign, curves=tuple(curves))
+        return time, force, path + np.repeat(away, 4)[: len(path)]
+
+    return faulty.changed(eight_particles(), displaced)
 
 
 @pytest.mark.extended

@@ -1,15 +1,14 @@
 """Robust noise: spikes neither move nor widen the answer, and clean data lose little."""
 
-import dataclasses
-
+import faulty
 import jax
 import numpy as np
 import numpyro
 import pytest
-from joint_cases import NOISE
+from joint_cases import eight_particles
 from numpyro.infer.util import log_density
 
-from mcc_jax import InputError, Model, compare, least_squares, paper_campaign, sample
+from mcc_jax import InputError, Model, compare, least_squares, sample
 from mcc_jax.calibrate import select_tests
 from mcc_jax.calibrate.noise import standard_promotion, student_weights
 
@@ -18,9 +17,7 @@ SPIKED, SPIKE_UM = 0.05, 0.5
 
 @pytest.fixture(scope="module")
 def clean():
-    """Eight particles of the paper."""
-    campaign = paper_campaign(0, instrument=NOISE)
-    return campaign.without(*campaign.particles[8:])
+    return eight_particles()
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +25,11 @@ def spiked(clean):
     """The same with spikes in one reading of twenty."""
     rng = np.random.default_rng(1)
 
-    def spoiled(curve):
-        hit = rng.random(len(curve)) < SPIKED
-        spikes = np.where(hit, SPIKE_UM * rng.standard_normal(len(curve)), 0.0)
-        return dataclasses.replace(curve, displacement_um=np.asarray(curve.displacement_um) + spikes)
+    def spoiled(time, force, path):
+        hit = rng.random(len(path)) < SPIKED
+        return time, force, path + np.where(hit, SPIKE_UM * rng.standard_normal(len(path)), 0.0)
 
-    return dataclasses.replace(clean, curves=tuple(spoiled(curve) for curve in clean.curves))
+    return faulty.changed(clean, spoiled)
 
 
 def modulus(result):

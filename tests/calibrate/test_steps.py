@@ -6,6 +6,7 @@ import pytest
 from helpers import ALL_FORMS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from joint_cases import A, flatness
 from scipy.integrate import trapezoid
 
 from mcc_jax import Instrument, Programme, paper_campaign, paper_law
@@ -50,9 +51,7 @@ def test_loading_curve_is_the_law_at_the_measured_points(exact):
     law = paper_law()
     for i in (0, 5, 15):
         curve = loading_curve(exact.curves[i], exact.diameters_um[i], find_segments(exact.curves[i]))
-        D1, D2, D3 = exact.diameters_um[i]
-        eta = 1 + 1.43 * (1 - D3**2 / (D1 * D2))
-        expected = np.asarray(law.plastic.strain(jnp.asarray(curve.stress_MPa[1:]))) / eta
+        expected = np.asarray(law.plastic.strain(jnp.asarray(curve.stress_MPa[1:]))) / _eta(exact)[i]
         np.testing.assert_allclose(curve.strain[1:], expected, rtol=1e-9)
 
 
@@ -162,10 +161,10 @@ def test_reference_follows_the_paper_s_rule(exact):
 @pytest.mark.parametrize("objective", ["full", "reference"])
 def test_negative_shape_parameters_are_found_and_equal_particles_have_none(objective):
     grid, reached = np.linspace(0, 5, 200), np.ones((8, 200), bool)
-    for flatness in (np.linspace(0.0, 0.6, 8), np.full(8, 0.3)):
-        strain = np.sqrt(grid) / (1 - 0.85 * flatness)[:, None]
-        fit = fit_shape_parameter(StrainTable(grid, strain, reached, flatness, np.arange(8)), objective)
-        if np.ptp(flatness):
+    for flat in (np.linspace(0.0, 0.6, 8), np.full(8, 0.3)):
+        strain = np.sqrt(grid) / (1 - 0.85 * flat)[:, None]
+        fit = fit_shape_parameter(StrainTable(grid, strain, reached, flat, np.arange(8)), objective)
+        if np.ptp(flat):
             assert fit.a == pytest.approx(-0.85, abs=1e-6)
         else:
             assert "same D3^2" in fit.reason
@@ -216,8 +215,7 @@ def test_a_spread_that_leaves_nothing_for_a_term_collapses_and_is_named():
 
 
 def _eta(campaign):
-    D1, D2, D3 = campaign.diameters_um.T
-    return 1 + 1.43 * (1 - D3**2 / (D1 * D2))
+    return 1 + A * flatness(campaign.diameters_um)
 
 
 @ALL_FORMS

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-import zipfile
 
 import pytest
 from books import write_book
 from helpers import refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_readers import zipped
 from test_valid_files import COLUMNS as MAPPING
 
 from mcc_jax._errors import InputError
@@ -223,9 +223,7 @@ def test_a_folder_of_each_known_format(tmp_path, content, peak, form):
 
 def test_archives_and_many_tests_in_a_file(tmp_path):
     folder = folder_of(tmp_path, {"b.txt": fischer(3)})
-    with zipfile.ZipFile(folder / "a.zip", "w") as archive:
-        for name in ("x.txt", "y.txt"):
-            archive.writestr(name, MICRO)
+    (folder / "a.zip").write_bytes(zipped(**{"x.txt": MICRO.encode(), "y.txt": MICRO.encode()}))
     campaign = read_instrument_file(folder, diameters_um=SIZES)
     assert campaign.particles == ("a-x", "a-y", "b-1", "b-2", "b-3")
     assert campaign.metadata.control is None

@@ -54,15 +54,10 @@ def test_a_hold_is_no_saturation(seed, readings, exactly):
     rng = np.random.default_rng(seed)
 
     def held(time, force, path):
-        top, step = int(np.argmax(force)), time[1] - time[0]
-        k = np.arange(1, readings + 1)
-        creep = 0.003 * path[top] * np.log1p(k / 5) / np.log1p(readings / 5)
+        top = int(np.argmax(force))
+        creep = 0.003 * path[top] * np.log1p(np.arange(1, readings + 1) / 5) / np.log1p(readings / 5)
         noise = np.zeros(readings) if exactly else 0.05 * rng.standard_normal(readings)
-        return (
-            np.concatenate([time[: top + 1], time[top] + step * k, time[top + 1 :] + step * readings]),
-            np.concatenate([force[: top + 1], force[top] + noise, force[top + 1 :]]),
-            np.concatenate([path[: top + 1], path[top] + creep, path[top + 1 :] + creep[-1]]),
-        )
+        return faulty.inserted(time, force, path, top, force[top] + noise, creep)
 
     checked = check_tests(noisy(faulty.changed(exact(), held), seed, noise_mN=0.0 if exactly else 0.05))
     assert not [one for one in campaign_findings(checked) if one.check == "saturation"]

@@ -4,9 +4,9 @@ import io
 import struct
 import zipfile
 
-import numpy as np
 import pytest
-from helpers import INSTRUMENTS, refusal
+from helpers import INSTRUMENTS, assert_holds, refusal
+from test_csv import assert_same
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import read_campaign, read_diameters, read_instrument_file, write_campaign
@@ -85,12 +85,7 @@ def test_format_is_told_by_content_and_campaign_survives_files(tmp_path, name):
     campaign = read(disguised)
     write_campaign(campaign, tmp_path / "c")
     again = read_campaign(tmp_path / "c")
-    assert again.metadata == campaign.metadata
-    assert again.particles == campaign.particles
-    for one, two in zip(campaign.curves, again.curves, strict=True):
-        assert np.array_equal(one.force_mN, two.force_mN)
-        assert np.array_equal(one.displacement_um, two.displacement_um)
-        assert np.array_equal(one.time_s, two.time_s)
+    assert_same(again, campaign)
     assert "data.bin" in (again.metadata.provenance or "")
 
 
@@ -152,10 +147,7 @@ def test_damaged_files(tmp_path, case):
     name, change, pieces = DAMAGE[case]
     path = tmp_path / name
     path.write_bytes("\n".join(change(lines_of(name))).encode("latin-1"))
-    text = message(path)
-    assert text.startswith(str(path))
-    for piece in pieces:
-        assert piece in text
+    assert_holds(message(path), [str(path), *pieces])
 
 
 def zipped(**files: bytes) -> bytes:

@@ -12,6 +12,7 @@ import pytest
 from helpers import refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_csv import make
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_instrument_file
@@ -22,6 +23,7 @@ time = { column = "t", unit = "s" }
 force = { column = "F", unit = "mN" }
 displacement = { column = "d", unit = "um" }
 """
+NUMBERED = COLUMNS.replace('"t"', "1").replace('"F"', "2").replace('"d"', "3")
 ROWS = [("0", "0", "0"), ("1", "2", "0.5"), ("2", "5", "1.25"), ("3", "1", "0.75")]
 FORCES, DISPLACEMENTS = [0, 2, 5, 1], [0, 0.5, 1.25, 0.75]
 
@@ -57,8 +59,7 @@ def test_trailing_delimiters_on_some_rows_and_without_header(tmp_path):
     lines = table().splitlines()
     lines[2] += ",,"
     assert_read(convert(tmp_path, "\n".join(lines)))
-    numbered = COLUMNS.replace('"t"', "1").replace('"F"', "2").replace('"d"', "3")
-    assert_read(convert(tmp_path, "\n".join(line + "," for line in lines[1:]), "header_rows = 0", numbered))
+    assert_read(convert(tmp_path, "\n".join(line + "," for line in lines[1:]), "header_rows = 0", NUMBERED))
 
 
 PARTICLES = "particle,D1_um,D2_um,D3_um\nA,200,190,180\nB,150,140,130\n"
@@ -68,9 +69,7 @@ CURVES = "particle,time_s,force_mN,displacement_um\n" + "".join(
 
 
 def campaign_of(folder, particles: str = PARTICLES, curves: str = CURVES) -> Campaign:
-    (folder / "particles.csv").write_text(particles, encoding="utf-8")
-    (folder / "curves.csv").write_text(curves, encoding="utf-8")
-    return read_campaign(folder)
+    return read_campaign(make(folder, particles, curves))
 
 
 @pytest.mark.parametrize("end", [",", ",,,", ", ,"])

@@ -1,4 +1,5 @@
 import os
+import shutil
 
 import pytest
 from asserting import refused, snapshot
@@ -6,34 +7,7 @@ from asserting import refused, snapshot
 from mcc_jax import calibrate
 from mcc_jax.cli import calibrate as command
 
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (None, ["curves.csv is missing"]),
-        (
-            "particle,time_s,force_mN,displacement_um\nA,0,0,0\nA,1,nan,1\n",
-            ["curves.csv", "row 3", "'force_mN'", "nan"],
-        ),
-    ],
-)
-def test_damaged_campaign(run, campaign, tmp_path, text, words):
-    (campaign / "curves.csv").unlink()
-    if text is not None:
-        (campaign / "curves.csv").write_text(text)
-    out = tmp_path / "fit"
-    line = refused(run("calibrate", campaign, "--out", out))
-    for word in words:
-        assert word in line
-    assert not out.exists()
-    out.mkdir()
-    (out / "calibration.json").write_text("old")
-    refused(run("calibrate", campaign, "--out", out))
-    assert snapshot(out) == {"calibration.json": b"old"}
-
-
 PROGRAMMES = {
-    "misspelt": ("rat = 2\n[[step]]\nramp_to = 1\n", "rat"),
     "never leaves zero": ("rate = 1\n[[step]]\nramp_to = 0\n", "zero"),
     "endless": ("rate = 1e-30\n[[step]]\nramp_to = 1\n", "higher rate"),
     "too many points": ("rate = 1\npoints = 1000000000\n[[step]]\nramp_to = 1\n", "fewer points"),
@@ -50,8 +24,11 @@ def test_bad_programme(run, tmp_path, kind):
     assert not (tmp_path / "sim").exists()
 
 
-# {c}: a campaign, {f}: a file, {n}: nothing there, {o}: a folder with old results
+# {c}: a campaign, {d}: a damaged one, {f}: a file, {n}: nothing there, {o}: a folder with old results
 COMMAND_LINES = {
+    "calibrate {d} --out {o}": "damaged/curves.csv, row 3, column 'force_mN': 'nan'",
+    "calibrate {d} --out {n}": "damaged/curves.csv, row 3, column 'force_mN': 'nan'",
+    "calibrate {o} --out {n}": "particles.csv is missing",
     "calibrate {n} --out {o}": "no such folder",
     "calibrate {f} --out {o}": "not a campaign folder",
     "calibrate {c}/curves.csv --out {o}": "is a file, not a campaign folder",
@@ -77,6 +54,7 @@ COMMAND_LINES = {
     "convert {f} --out {o} --diameters 1,2,3": "--mapping",
     "convert {c}/curves.csv --out {o} --mapping {f}": "TOML",
     "simulate --out {o} --particles {c}/curves.csv": "curves.csv, row 3",
+    "simulate --out {o} --programme {n}": "there is no such file",
     "simulate --out {o} --programme {f} --rate 1": "--programme",
     "simulate --out {o} --points 9 --interval-s 1": "--points",
     "simulate --out {o} --interval-s 1e-9": "rows",
@@ -103,8 +81,10 @@ def test_bad_command_line(run, simulated, tmp_path, line):
     file.write_text("nothing of use\n")
     old.mkdir()
     (old / "calibration.json").write_text("old")
+    damaged = shutil.copytree(simulated, tmp_path / "damaged")
+    (damaged / "curves.csv").write_text("particle,time_s,force_mN,displacement_um\nA,0,0,0\nA,1,nan,1\n")
     before = snapshot(tmp_path)
-    places = {"c": simulated, "f": file, "n": tmp_path / "nothing", "o": old}
+    places = {"c": simulated, "d": damaged, "f": file, "n": tmp_path / "nothing", "o": old}
     line_shown = refused(run(*(word.format(**places) for word in line.split(" "))))
     assert COMMAND_LINES[line] in line_shown
     assert snapshot(tmp_path) == before

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from asserting import done, snapshot
+from helpers import assert_holds
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
 from mcc_jax.discovery.sentences import verdict_in_words
@@ -93,8 +94,7 @@ def test_the_command_says_what_it_found(found):
     content = json.loads((out / "discovery.json").read_text(encoding="utf-8"))
     assert f"Verdict: {verdict_in_words(content)}" in text
     assert " ".join(content["summary"].split()) in " ".join(text.split())
-    for word in ("mechanism", "statistic", "detection limit", "probability", "frame_compliance", str(out)):
-        assert word in text
+    assert_holds(text, ["mechanism", "statistic", "detection limit", "probability", "frame_compliance", str(out)])
     assert len(content["figures"]) == 6
     assert set(snapshot(out)) == {"discovery.json", "discovery.msgpack", "figures", *content["figures"]}
     for name in content["figures"]:

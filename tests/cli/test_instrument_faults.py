@@ -6,6 +6,7 @@ import faulty
 import numpy as np
 import pytest
 from asserting import done, refused
+from helpers import assert_holds
 
 from mcc_jax.campaign import Campaign, write_campaign
 
@@ -44,8 +45,7 @@ def test_findings_are_in_the_result_on_the_terminal_and_on_the_page(fitted):
     for entry in content["particles"]:
         assert entry["force_zero_mN"]["value"] == pytest.approx(20.0, abs=0.1)
     page = (out / "report.html").read_text(encoding="utf-8")
-    for words in ("Tests: breakage", "the particle broke at", "Tests: zero of force"):
-        assert words in page
+    assert_holds(page, ["Tests: breakage", "the particle broke at", "Tests: zero of force"])
 
 
 def test_leave_out_takes_particles_out_by_name(run, tests, tmp_path):

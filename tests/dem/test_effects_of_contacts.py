@@ -5,12 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_pair_law import ON_PATH, PARTICLE, UM, cycle, driven, law_of, on_pair, on_wall, with_all
+from helpers import Softer
+from test_pair_law import ON_PATH, PARTICLE, UM, cycle, driven, law_of, on_pair, with_all
 
 from benchmarks import energy_paths
-from mcc_jax import InputError, Particle, Unloading, drive
+from mcc_jax import InputError, Particle, Unloading
 from mcc_jax.dem import half_contact, pair_recovery, spheres, wall_energy, wall_force
-from mcc_jax.effects import LIBRARY, AbstractEffect, AbstractModulusAtPeak, find_variant
+from mcc_jax.effects import LIBRARY, AbstractEffect, find_variant
 from mcc_jax.law import StrainScaling
 
 CLOSED = [v for m in ("damage", "densification_stiffening", "size_effect", "shape_second_order") for v in LIBRARY[m]]
@@ -20,16 +21,6 @@ OTHERS = [v for m in LIBRARY.values() for v in m if v not in CLOSED]
 
 
 # ---- physics ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("unloading", [Unloading.PRINTED, Unloading.PUNCH])
-def test_two_halves_are_the_plate_test(unloading):
-    """T1 and T2 with effects: two walls, and two equal particles, give what `drive` gives."""
-    law, displacement = with_all(unloading), cycle(45.0)
-    expected = 1e-3 * drive(law, PARTICLE, displacement, time=np.arange(len(displacement))).force
-    side = half_contact(law, PARTICLE)
-    for force, overlaps in ((on_wall(side), 0.5e-6 * displacement), (on_pair(side, side), 1e-6 * displacement)):
-        assert np.max(np.abs(driven(force, overlaps) - expected)) <= 1e-12 * np.max(expected)
 
 
 @pytest.mark.extended
@@ -133,13 +124,6 @@ def test_everything_else_is_refused_by_name(variant):
         half_contact(law, PARTICLE)
     rest = law.of_particle() if effect.of_instrument else law.without_effects(variant.label)
     assert eqx.tree_equal(half_contact(rest, PARTICLE), half_contact(law_of(), PARTICLE))
-
-
-class Softer(AbstractModulusAtPeak):
-    """A user's own formula of the peak."""
-
-    def factor(self, strain, stress):
-        return 1 / (1 + self.amplitude * strain * stress)
 
 
 class Anyhow(AbstractEffect):

@@ -77,7 +77,6 @@ def test_what_a_pair_loses_never_falls(unloading):
 
 
 DIAMETER = 100.0
-REST = np.zeros((2, 3))
 
 
 @pytest.mark.extended

@@ -37,7 +37,6 @@ from mcc_jax.dem import (
 )
 from mcc_jax.simulate import paper_population
 
-REST = np.zeros((3, 3))
 STEP = jax.jit(step)
 
 

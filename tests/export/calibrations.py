@@ -7,17 +7,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from asserting import estimate
 
 from mcc_jax import load
 from mcc_jax.calibrate.results import Calibration
 
 SIZES = {"A": (200, 190, 160), "b c": (150, 140, 130), "falling": (150, 140, 130), "out": (100, 90, 80)}
 POPULATION = {"C1": (math.log(6.7), 0.3), "C3": (math.log(3.0), 0.0), "C5": (math.log(2.66), 0.08)}
-
-
-def estimate(value, sd=None):
-    interval = None if sd is None else [value - 1.96 * sd, value + 1.96 * sd]
-    return {"value": value, "sd": sd, "interval_95": interval}
 
 
 def entry(name, C1, C3, C5, kept=True):

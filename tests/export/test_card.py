@@ -4,7 +4,8 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import pytest
-from calibrations import estimate, write
+from asserting import estimate
+from calibrations import write
 from compiling import PARTICLE
 
 from mcc_jax import Particle, Unloading, paper_law

@@ -1,12 +1,10 @@
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
 import pytest
-from asserting import refused
-from calibrations import content, estimate, write
+from asserting import estimate, refused
+from calibrations import content, write
 from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
 
 from mcc_jax.cli.outputs import FORMATS as OFFERED
@@ -130,11 +128,3 @@ def test_bad_input_is_one_line_and_writes_nothing(run, tmp_path, kind):
     (out / "mcc_law.h").write_text("old")
     refused(run("export", folder, "--format", "c", "--out", out, *options))
     assert [p.read_text() for p in out.iterdir()] == ["old"]
-
-
-@pytest.mark.extended
-def test_help_does_not_import_jax():
-    code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import run\n"
-    code += "try:\n    run()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "--allow-not-monotone" in done.stdout

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import PAIR, PARTICLE, PLATES, WALL, assert_same, build_driver, random_laws, random_paths
+from helpers import Softer
 from test_recipes import run_recipe
 from test_tables import assert_rebuilt
 
@@ -24,13 +25,6 @@ NAMED = {
     "shape": ("shape_second_order:in_plane_aspect", "shape_second_order", "densification_stiffening:relative_density"),
 }
 OPEN = [v for m in LIBRARY.values() for v in m if not v.build(v.typical).closed]
-
-
-class Softer(AbstractModulusAtPeak):
-    """A user's own: E / (1 + kappa eps_P sigma_P)."""
-
-    def factor(self, strain, stress):
-        return 1 / (1 + self.amplitude * jnp.maximum(strain, 0.0) ** 2 * jnp.sqrt(stress))
 
 
 @pytest.mark.parametrize("names", [*NAMED.values(), (Softer(0.4),)], ids=[*NAMED, "own"])

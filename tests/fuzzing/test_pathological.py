@@ -52,15 +52,11 @@ def test_hundreds_of_cycles_are_selected(name):
     assert (chosen.tests.loading & chosen.tests.mask).sum(axis=1).min() >= 12
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_ends_in_one_line_with_a_remedy(name):
-    found = run_one(BY_NAME[name], 1, "least-squares")
-    assert (found.how, found.fault) == ("refused", ""), found
-
-
-@pytest.mark.parametrize("name", ["unloading only", "hold only"])
-def test_command_ends_in_one_line(name):
-    found = run_one(BY_NAME[name], 1, COMMAND)
+@pytest.mark.parametrize(
+    ("name", "method"), [*((name, "least-squares") for name in REFUSED), *((REFUSED[i], COMMAND) for i in (0, 3))]
+)
+def test_ends_in_one_line_with_a_remedy(name, method):
+    found = run_one(BY_NAME[name], 1, method)
     assert (found.how, found.fault) == ("refused", ""), found
 
 

@@ -173,8 +173,14 @@ def one_step(law, particle, state, value, load):
     return jnp.stack([response, state.displacement_max])
 
 
+def energies(law, particle, state, value, load):
+    """Where the particle then is: at the displacement, or where the force takes it."""
+    now = law.step_load(particle, state, value)[1] if load else value
+    return jnp.stack(jax.tree.leaves(law.energy(particle, state, now)))
+
+
 @pytest.mark.extended
-@pytest.mark.parametrize("function", [along_a_path, one_step])
+@pytest.mark.parametrize("function", [along_a_path, one_step, energies])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @SOME_FORMS
 def test_value_and_derivatives_are_finite_where_branches_meet(unloading, scaling, dtype, function):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from asserting import estimate as without_error
 
 from mcc_jax.calibrate import Posterior
 from mcc_jax.calibrate.data import rows_from_contact
@@ -41,11 +42,7 @@ def campaign(names=NAMES, zero=ZERO):
 
 
 def estimate(value, sd=0.01):
-    return {"value": value, "sd": sd, "interval_95": [value - 1.96 * sd, value + 1.96 * sd]}
-
-
-def nothing():
-    return {"value": None, "sd": None, "interval_95": None}
+    return without_error(value, sd)
 
 
 def calibration(names=NAMES, **changes):
@@ -55,7 +52,7 @@ def calibration(names=NAMES, **changes):
         kept = i < len(names) - 1
         eta = 1 + A * (1 - SIZES[i, 2] ** 2 / (SIZES[i, 0] * SIZES[i, 1]))
         values = {"eta_p": eta, "C1": C[i, 0], "C3": C[i, 1], "C5": C[i, 2], "zero_um": ZERO[i]}
-        entry = {key: estimate(value) if kept else nothing() for key, value in values.items()}
+        entry = {key: estimate(value) if kept else without_error(None) for key, value in values.items()}
         why_not = None if kept else "has 3 usable points on loading, fewer than 12"
         particles.append(
             {"particle": name, **entry, "rms_um": NOISE if kept else None, "kept": kept, "why_not": why_not}
@@ -95,7 +92,7 @@ def discovery(**changes):
     place = {"segment": "loading", "load_fraction": [0.1, 0.3], "strain": [0.0, 0.4], "share": 0.6}
     place |= {"particles": ["1", "C"], "direction": "more displacement than the law"}
     further = {"experiment": "a hold of 60 s at the largest load", "separates": rivals, "particles": 6, "power": 0.95}
-    logs = {f"log_C{k}": {"mean": estimate(m), "sd": nothing()} for k, m in ((1, 1.9), (3, 1.0), (5, 0.9))}
+    logs = {f"log_C{k}": {"mean": estimate(m), "sd": without_error(None)} for k, m in ((1, 1.9), (3, 1.0), (5, 0.9))}
     step = {"chi2_per_dof": 2.0, "systematic_um": 0.07, "elpd": 0.0, "elpd_se": 0.0}
     steps = [{"added": None, **step}, {"added": "frame_compliance", **step, "systematic_um": 0.001}]
     return {

@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import numpy as np
+from asserting import estimate
 from results_folder import MODULUS, NAMES, NOISE, calibration, changed
 from results_folder import C as COEFFICIENTS
 
@@ -35,14 +36,13 @@ def test_a_wrong_coefficient_shows_as_misfit(without_posterior):
 def test_own_modulus_and_own_shape_are_used_where_they_scatter(without_posterior):
     content = calibration()["particles"]
     for entry in content[:-1]:
-        entry["effective_modulus_MPa"] = {"value": MODULUS, "sd": None, "interval_95": None}
-    scatter = {"value": 0.1, "sd": None, "interval_95": None}
-    wrong = {"value": 2000.0, "sd": None, "interval_95": None}
+        entry["effective_modulus_MPa"] = estimate(MODULUS)
+    scatter, wrong = estimate(0.1), estimate(2000.0)
     found = changed(without_posterior, particles=content, modulus_scatter=scatter, effective_modulus_MPa=wrong)
     for one in compare(found)[:-1]:
         np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
         assert np.abs(one.typical_um - one.own_um)[one.kind == KINDS.index("unload")].max() > 0.1
-    found = changed(without_posterior, shape_scatter=scatter, a={"value": 0.5, "sd": None, "interval_95": None})
+    found = changed(without_posterior, shape_scatter=scatter, a=estimate(0.5))
     for one in compare(found)[:-1]:
         np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
 
@@ -53,11 +53,8 @@ def test_the_typical_particle_is_the_median_or_for_the_papers_method_the_mean(fo
     mean = compare(changed(folder, method="paper"))[0]
     top = np.argmax(median.force_mN)
     assert mean.typical_um[top] < median.typical_um[top]
-    no_sd = {"sd": None, "interval_95": None}
-    log_C = {
-        f"log_C{k}": {"mean": {"value": math.log(c), **no_sd}, "sd": {"value": 0.0, **no_sd}}
-        for k, c in zip((1, 3, 5), COEFFICIENTS[0], strict=True)
-    }
+    pairs = zip((1, 3, 5), COEFFICIENTS[0], strict=True)
+    log_C = {f"log_C{k}": {"mean": estimate(math.log(c)), "sd": estimate(0.0)} for k, c in pairs}
     for method in ("paper", "least-squares"):
         one = compare(changed(folder, method=method, figures=[], **log_C))[0]
         np.testing.assert_allclose(one.typical_um, one.own_um, atol=1e-7)

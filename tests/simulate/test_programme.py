@@ -60,10 +60,8 @@ def test_a_ramp_of_less_than_a_picosecond_is_none():
         (lambda: Programme("load", steps=(Ramp(1.0, 1.0),), points=10, interval_s=1.0), "exactly one of"),
         (lambda: Programme("load", steps=(), points=10), "at least one step"),
         (lambda: Programme("load", steps=(Ramp(1.0, 1.0),), points=1), "points"),
-        (lambda: Programme("load", steps=(Ramp(1.0, 1.0),), interval_s=-1.0), "interval_s"),
         (lambda: Ramp(1.0, 0.0), "rate"),
         (lambda: Ramp(-1.0, 1.0), "level"),
-        (lambda: Ramp(1.0, float("nan")), "rate"),
         (lambda: Hold(0.0), "hold"),
     ],
 )
@@ -101,8 +99,3 @@ def test_bad_programme_files_are_refused_in_one_line(tmp_path, text, message):
     file.write_text(text)
     with pytest.raises(InputError, match=rf"programme\.toml.*{re.escape(message)}"):
         read_programme(file)
-
-
-def test_missing_programme_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="there is no such file"):
-        read_programme(tmp_path / "none.toml")
