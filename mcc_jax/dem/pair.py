@@ -214,9 +214,6 @@ def _peak_and_drop(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLi
     return peak, peak - now
 
 
-# ---- inside ----------------------------------------------------------------------------------------------------------
-
-
 class _Series(NamedTuple):
     """Loading of the two sides: compressions, common force."""
 

@@ -32,9 +32,6 @@ AT_ONCE = 6, 18  # columns that are whitened in one call, at least and at most
 ENTRIES = 270_000  # numbers that these hold together, about, so that they stay in a processor's own memory
 
 
-# ---- whitening -------------------------------------------------------------------------------------------------------
-
-
 class White(NamedTuple):
     """Whitened columns: their noise is independent from point to point and of variance 1."""
 
@@ -121,9 +118,6 @@ class Columns:
             total += np.asarray(slope_of(of_white, *self._given(hyper, piece)))
             ones = 0.0 * ones  # density and readings count once
         return total
-
-
-# ---- design ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -85,9 +85,6 @@ class Hypothesis:
         return hyper, design
 
 
-# ---- formulas that may be wrong --------------------------------------------------------------------------------------
-
-
 def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, np.ndarray], np.ndarray]) -> None:
     """The form of a hypothesis where every name's formula may be wrong by a share of the effect.
 
@@ -173,9 +170,6 @@ class Discrepancy:
     def curve_um(self, at: Fitted) -> np.ndarray:
         """What it adds to the law's displacement at every point, where it is part of a hypothesis [um]."""
         return np.concatenate(self.parts, -1) @ at.solution.common[at.design.group > 0]
-
-
-# ---- effects that differ from test to test ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,6 @@ PLACES_OF_STEPS = 24  # of a sudden step in each test
 SHARES = 60  # points of the common path on which the residuals of two tests are multiplied
 
 
-# ---- bootstrap -------------------------------------------------------------------------------------------------------
-
-
 class _Statistic:
     """The log evidence of anything against nothing, from scores at the base law's hyperparameters."""
 
@@ -115,9 +112,6 @@ def _steps(base: Base, height: float, count: int) -> np.ndarray:
             for k, j in enumerate(rows[np.linspace(1, len(rows) - 1, count).astype(int)]):
                 columns[i, j:, k] = np.where(mask[i, j:], height, 0.0)
     return columns
-
-
-# ---- held-out particles ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,6 @@ def padded(directions: int) -> int:
     return -(-directions // DIRECTIONS) * DIRECTIONS + 1
 
 
-# ---- the law along measured tests ------------------------------------------------------------------------------------
-
-
 class Numbers(NamedTuple):
     """Of every test: C1, C3, C5, a and the effective modulus; the force of every point and that from which its branch
     starts [mN]; amplitude and further numbers of each effect."""
@@ -215,9 +212,6 @@ def _reached(forms: Forms, law: Array, loads: Any, tests: Any, there: Any, direc
     slope = slope_at(law, particle, strain, factors, by_strain)
     given, along = (strain - off / slope, *loads), (-change / slope[None], *directions[1])
     return _staged(peak, given, along, tests, None)
-
-
-# ---- every effect at its null ----------------------------------------------------------------------------------------
 
 
 def signatures(base: MccLaw, particle: Particle, record: Record, effects: Sequence[AbstractEffect]) -> Array:

@@ -29,9 +29,6 @@ HALVINGS = 64  # from the width of the bracket to below the rounding of a double
 NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effects/test_physics.py
 
 
-# ---- effects as users give them --------------------------------------------------------------------------------------
-
-
 def given_effects(effects: Any) -> tuple[AbstractEffect, ...]:
     """Effects from effects, variants and names, or from one of these."""
     given = [effects] if isinstance(effects, str | Variant | AbstractEffect) else effects
@@ -78,9 +75,6 @@ def initial_memory(
     own = tuple(effect.start(zero) for effect in effects)
     drivers = tuple(None if memory is None else zero for memory in own)
     return Memory(first_point(zero.dtype, humidity, time), zero, own, drivers)
-
-
-# ---- along a path ----------------------------------------------------------------------------------------------------
 
 
 def peak_forces(record: Record, before: Scalar) -> Path:
@@ -187,9 +181,6 @@ def force_at(displacement_under: Callable[..., Scalar], given: Any, displacement
     return root + jnp.where(touches, change, 0.0)
 
 
-# ---- virgin loading whose three terms carry factors that depend on strain and rate -----------------------------------
-
-
 def strain_under(effects: Effects, law: Formulas, particle: Particle, record: Record, stress: Path) -> Path:
     r"""Strain of virgin loading at a stress [MPa] when effects change the loading curve; 0 at and below zero.
 
@@ -254,9 +245,6 @@ def _with_factors(law: Formulas, like: Path, factors: Sequence[Factors]) -> Quin
     for f1, f3, f5 in factors:
         K1, K3, K5 = K1 * f1, K3 * f3, K5 * f5
     return Quintic(K1, K3, K5)
-
-
-# ---- effects that are closed formulas of particle and peak -----------------------------------------------------------
 
 
 def folded(law: Formulas, effects: Effects, particle: Particle, what: str) -> tuple[Formulas, AtPeak]:
