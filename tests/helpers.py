@@ -122,9 +122,6 @@ class Softer(AbstractModulusAtPeak):
         return 1 / (1 + self.amplitude * jnp.maximum(strain, 0.0) ** 2 * jnp.sqrt(stress))
 
 
-# ---- the law, compiled once for all tests of a file ------------------------------------------------------------------
-
-
 @eqx.filter_jit
 def force_along(law, particle, displacements):
     """Forces [mN] along a path of displacements [um] that starts on a fresh contact."""

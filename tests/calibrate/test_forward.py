@@ -133,9 +133,6 @@ def test_how_errors_of_force_move_a_prediction(law, theta, hum):
     assert np.median(np.asarray(linear.by_force)[smooth & elastic]) < np.median(np.asarray(linear.by_force)[loading])
 
 
-# ---- the start without iteration -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("offset", [0.0, 0.013, -0.013, 0.03, -0.03])
 def test_the_start_lands_near_the_truth(offset):
     """With the recorded contact off by a share of the effective diameter."""

@@ -118,9 +118,6 @@ def test_numpy_has_one_thread_meanwhile_and_its_own_afterwards():
         assert threads() == before
 
 
-# ---- many particles: the exact likelihood by regression --------------------------------------------------------------
-
-
 @pytest.mark.extended
 def test_a_slope_is_found_through_any_rotation_of_the_parameters():
     rng = np.random.default_rng(0)

@@ -121,9 +121,6 @@ def test_the_covariance_is_that_of_scipy_s_jacobian(result, by_scipy):
     np.testing.assert_allclose(sd, scale[count * own], rtol=1e-3)
 
 
-# ---- what the data leave open ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.extended
 @pytest.mark.parametrize("max_steps", [100, 2])
 def test_a_parameter_without_data_stays_where_it_is(max_steps):
@@ -143,9 +140,6 @@ def test_a_parameter_without_data_stays_where_it_is(max_steps):
     assert float(found.value.shared[2]) == -3.0
     for block in found.normal.covariance():
         assert np.all(np.isfinite(np.asarray(block)))
-
-
-# ---- robust losses ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

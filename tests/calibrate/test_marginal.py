@@ -254,9 +254,6 @@ def test_beyond_the_range_of_the_map_and_of_shape_factors_nothing_is_nan():
     assert value[1] < value[0] - 100
 
 
-# ---- from tests to their summary -------------------------------------------------------------------------------------
-
-
 @pytest.mark.extended
 @pytest.mark.parametrize("known", [None, 0.2], ids=["", "errors of zero and peak"])
 def test_summaries_of_linear_tests_are_exact(known):
@@ -290,9 +287,6 @@ def test_summaries_of_linear_tests_are_exact(known):
         law = multivariate_normal((X @ u[i] + zero)[mask], total[mask][:, mask])
         expected = law.logpdf(np.asarray(linear.residual[i])[mask])
         np.testing.assert_allclose(actual[i], expected, rtol=1e-9, atol=1e-4)
-
-
-# ---- Cholesky factors written out entry by entry, against LAPACK -----------------------------------------------------
 
 
 @jax.jit

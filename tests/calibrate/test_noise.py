@@ -143,9 +143,6 @@ def test_white_noise_only_divides_and_a_display_reads_in_steps():
     np.testing.assert_allclose(float(filtered.reading), POINTS * READING_UM**2, rtol=1e-12)
 
 
-# ---- numbers integrated out, and the noise estimated -----------------------------------------------------------------
-
-
 def likelihoods(scale, tests, linear, logs, zero_sd=2.0):
     return grams_and_likelihoods(scale, tests, linear, logs, jnp.asarray(zero_sd), *KINDS[0])[1]
 
@@ -238,9 +235,6 @@ def test_data_without_noise_end_at_the_bound_and_stay_finite():
     assert np.all(np.isfinite(np.asarray(found.noise.logs)))
     assert np.all(np.isfinite(found.log_sd))
     assert float(found.noise.displacement) < 1e-3
-
-
-# ---- scales of the particles -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [1, 2, 20])

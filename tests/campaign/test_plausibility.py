@@ -324,9 +324,6 @@ def test_nothing_makes_it_fail(samples, count, data):
         assert not finding.sentence.endswith(".")
 
 
-# ---- measured records ------------------------------------------------------------------------------------------
-
-
 def read_pebble(file):
     """Diameter [mm], and travel [mm] and force [N] of one record; None for a record without a diameter."""
     diameter, rows = None, []

@@ -19,9 +19,6 @@ pytestmark = pytest.mark.extended
 COUNT = 30
 
 
-# ---- jax-md ----------------------------------------------------------------------------------------------------------
-
-
 def listed(format_name, index, overflow=False):
     """What the adapter reads of jax-md's list; a test below takes the list of jax-md itself."""
     return types.SimpleNamespace(
@@ -65,9 +62,6 @@ def test_jaxmd_finds_the_same_pairs():
     expected = list_edges(near, COUNT, edges.capacity)
     assert len(near) > 20
     np.testing.assert_array_equal(edges.key, expected.key)
-
-
-# ---- JaxDEM ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -73,9 +73,6 @@ def head(kind, steps, law, diameters, others=None, x_max=0.0):
     return np.hstack([*parts, np.full((count, 1), x_max)])
 
 
-# ---- random laws and paths, and the library along them ---------------------------------------------------------------
-
-
 def random_laws(rng, count, unloading, scaling, monotone=False):
     """Laws and diameters [um] far around the paper's; unless excluded, some are not monotone."""
     C1, C5 = rng.uniform(3, 15, count), rng.uniform(1.8, 3.5, count)

@@ -142,9 +142,6 @@ def test_derivatives_at_zero(mode, form):
     np.testing.assert_array_equal(mode(virgin)(jnp.array(-0.1)), 0)
 
 
-# ---- tests by number ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("strain", "printed"), [(1e-4, "-6.014885e-8"), (1e-3, "-6.0148362e-6"), (1e-2, "-6.0099545e-4")]
 )

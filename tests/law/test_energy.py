@@ -138,9 +138,6 @@ def test_no_work_where_the_quintic_would_pull(C3):
         close(exact[k], slope, rel=2e-5)
 
 
-# ---- the limit of recovery -------------------------------------------------------------------------------------------
-
-
 @eqx.filter_jit
 def balance(law, particle, strain):
     """Dissipated energy and loading force at peaks, with the derivative of the one over the other."""
