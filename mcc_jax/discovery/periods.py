@@ -1,4 +1,8 @@
-"""What repeats with travel or with time: its period, by a periodogram of what the law leaves."""
+"""What repeats with travel or with time: its period, by a periodogram of what the law leaves.
+
+Bretthorst (1988), Bayesian Spectrum Analysis and Parameter Estimation, Lecture Notes in Statistics 48. A cosine and a
+sine of unknown amplitudes and frequency are compared with the law alone, whose numbers are integrated out.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ AT_ONCE = 32  # frequencies whose information is worked out together
 
 @dataclass(frozen=True)
 class Periodogram:
-    """Sinusoids of one coordinate against the law alone, all numbers of the law integrated out (Bretthorst 1988)."""
+    """Sinusoids of one coordinate against the law alone."""
 
     coordinate: str
     frequency: np.ndarray  # periods per unit of the coordinate
