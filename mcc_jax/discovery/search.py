@@ -66,8 +66,6 @@ class Search:
         candidates = self.candidates.of(library)
         return screen(self.base, self.null.state, self.null.optimum.hyper, candidates, several=several)
 
-    # ---- posterior ---------------------------------------------------------------------------------------------------
-
     def log_posteriors(self) -> dict[Names, float]:
         """Log evidence and log prior of every hypothesis that may be named, best first: pairs lead by the margin."""
         logs = self._log_joints()
@@ -112,8 +110,6 @@ class Search:
         second = min(names, key=lambda n: self.found[(n,)].log_evidence)
         sizes = zip(r.variants, r.theta, strict=False)
         return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
-
-    # ---- one name ----------------------------------------------------------------------------------------------------
 
     @cached_property
     def first_order(self) -> dict[str, dict[str, tuple[float, int]]]:
@@ -188,8 +184,6 @@ class Search:
         if self.library[name].sudden:
             return sudden_steps(self.base, start, self.library[name].variants[0])
         return random_amplitude(self.base, start, self.candidates.of({name: self.library[name]}))
-
-    # ---- two names ---------------------------------------------------------------------------------------------------
 
     def seconds(self, at: Fitted, first: Variant) -> list[tuple[float, int, Candidate]]:
         """Candidates next to a fitted name, best first: gain in log evidence to first order around it, and row."""
@@ -292,8 +286,6 @@ class Search:
             own = replace(own, log_evidence=value)
         if names not in self.found or value > self.found[names].alone:
             self.found[names] = Hypothesis(names, value, at=None if own is None else own.at, own=own)
-
-    # ---- all of it ---------------------------------------------------------------------------------------------------
 
     def run(self) -> Search:
         """Work all hypotheses out."""

@@ -149,8 +149,6 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             valid = valid & jnp.all(jnp.isfinite(leaf))
         return valid
 
-    # ---- effects -----------------------------------------------------------------------------------------------------
-
     def with_effects(self, *effects: Any) -> MccLaw:
         """The law with further effects: by name, "mechanism" or "mechanism:variant", or as a `Variant`, both with the
         middle of its plausible range; or built with another amplitude."""
@@ -175,8 +173,6 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         """Displacement [um] that stays after full release, by the formulas without effects."""
         peak = history.displacement_max
         return peak - self.contact(particle).recovered(peak).displacement
-
-    # ---- force and displacement --------------------------------------------------------------------------------------
 
     def init(self, particle: Particle, relative_humidity: Scalar | None = None) -> History:
         """A virgin particle at the beginning of its test; relative humidity [%], the reference if None."""
@@ -260,8 +256,6 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         last = record, highest, context.peak_displacement
         point, peak_force, peak = jax.tree.map(lambda x: x[-1] if x.ndim else x, last)
         return History(peak, response.Memory(point, peak_force, own, drivers)), context.displacement + added
-
-    # ---- energy ------------------------------------------------------------------------------------------------------
 
     @compiled_whole
     def gain_strain(self, particle: Particle, state: History) -> Scalar:
