@@ -35,8 +35,7 @@ class Periodogram:
     best: float  # the likeliest frequency
 
     def log_ratios(self, sizes: np.ndarray, power: np.ndarray) -> np.ndarray:
-        """Log evidence of a sinusoid of each frequency, whose amplitudes have one of several standard deviations [um];
-        `power` may be that of other campaigns, shape (campaigns, frequencies)."""
+        """Log evidence of each frequency in campaigns of some powers; sds of the amplitudes are one of `sizes` [um]."""
         strength = sizes[:, None, None] ** 2 * self.information
         each = power * strength / (1 + strength) - np.log1p(strength)
         return np.asarray(logsumexp(each, axis=0)) - np.log(len(sizes))

@@ -335,8 +335,7 @@ class Search:
         self.fit_misfits(self.fit_pairs(self.leading_pairs()), leaders[0])
 
     def in_other_form(self, names: Names, alone: Fitted, base: Base) -> float:
-        """Log posterior of a hypothesis, by its best formulas, in the form of unloading of another base, which fits the
-        tests `alone` as it does there."""
+        """Log posterior of a hypothesis, by its best formulas, in the form of another base, whose law `alone` fits so."""
         one, at = self.found[names], alone
         if names == UNLISTED:
             at = self.discrepancy.added_to(base, alone) or alone
