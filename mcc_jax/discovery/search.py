@@ -335,7 +335,7 @@ class Search:
         self.fit_misfits(self.fit_pairs(self.leading_pairs()), leaders[0])
 
     def in_other_form(self, names: Names, alone: Fitted, base: Base) -> float:
-        """Log posterior of a hypothesis, by its best formulas, in the form of another base, whose law `alone` fits so."""
+        """Log posterior of a hypothesis, by its best formulas, in another base's form, where the law fits `alone`."""
         one, at = self.found[names], alone
         if names == UNLISTED:
             at = self.discrepancy.added_to(base, alone) or alone
