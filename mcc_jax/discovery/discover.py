@@ -235,9 +235,6 @@ def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
         alone = fit_hypothesis(base, base.state, (), (), search.null.optimum.hyper)
         if alone.log_evidence < search.null.log_evidence + STRONG:
             return None
-        leader, best = next(iter(search.log_posteriors().items()))
-        if all(search.in_other_form(names, alone, base) < best for names in ((), leader)):
-            return None
         search.progress("the same in the law's other form of unloading")
         other = Search(base, search.library, search.whole, search.progress)
     _run(other, seed)

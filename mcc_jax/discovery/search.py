@@ -334,17 +334,6 @@ class Search:
             self.pairs_with(leader)
         self.fit_misfits(self.fit_pairs(self.leading_pairs()), leaders[0])
 
-    def in_other_form(self, names: Names, alone: Fitted, base: Base) -> float:
-        """Log posterior of a hypothesis, by its best formulas, in another base's form, where the law fits `alone`."""
-        one, at = self.found[names], alone
-        if names == UNLISTED:
-            at = self.discrepancy.added_to(base, alone) or alone
-        elif one.own is not None:
-            at = one.own.next_to(base, alone.state, one.fitted.variants, one.fitted.theta, self.small).at
-        elif names:
-            at = fit_hypothesis(base, alone.state, one.fitted.variants, one.fitted.theta, self.small)
-        return self.log_posteriors()[names] + at.log_evidence - one.fitted.log_evidence
-
     def other_noise(self) -> None:
         """Average the leading hypotheses over kinds of noise, if another kind may explain the gap or a second name."""
         logs = self.log_posteriors()
