@@ -187,8 +187,10 @@ def check_packing(packing: Packing) -> None:
     """Refuse half contacts that resist nothing, naming the first such particle."""
     valid = np.asarray(jax.vmap(lambda side: side.is_valid)(packing.sides))
     valid = valid & np.asarray((packing.radius > 0) & (packing.mass > 0))
-    for first in np.flatnonzero(~valid):
-        problem = f"particle {first} has no positive radius, mass or stiffness, or a shape factor <= 0"
+    if not valid.all():
+        problem = (
+            f"particle {np.flatnonzero(~valid)[0]} has no positive radius, mass or stiffness, or a shape factor <= 0"
+        )
         raise InputError(problem, remedy="Check its coefficients and diameters.")
 
 

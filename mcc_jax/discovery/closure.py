@@ -100,8 +100,8 @@ def closure(search: Search, seed: int) -> Closure:
     moving = {n: x for n, x in natural.items() if span[n][1] > span[n][0]}
     every = {n: terms_of(LETTERS[n][0], x, *span[n]) for n, x in moving.items() if n != "drive"}
     periods = {one.coordinate: one for one in search.discrepancy.periods}
-    for n, one in periods.items():
-        every[n] = every.get(n, {}) | _sinusoids(LETTERS[n][0], moving[n], one, size)
+    sinusoids = {n: _sinusoids(LETTERS[n][0], moving[n], one, size) for n, one in periods.items()}
+    every |= {n: every.get(n, {}) | of_one for n, of_one in sinusoids.items()}
     terms = [(name, text) for name, of_one in every.items() for text in of_one]
     values = np.stack([x * size[:, None] for of_one in every.values() for x in of_one.values()], -1)
     values = np.where(mask[..., None], values, 0.0)
@@ -120,11 +120,13 @@ def closure(search: Search, seed: int) -> Closure:
     meanings = dict.fromkeys(" = ".join(LETTERS[terms[k][0]]) for k in chosen)
     # Weights along the coordinate have the size that the smooth discrepancy was found to have, in units of strain.
     unit = float(np.sqrt(np.mean((curve / size[:, None])[mask] ** 2)))
-    basis, x, one = _cosines(search.at[name]) * size[:, None, None], np.linspace(*span[name], POINTS), periods.get(name)
-    there = _cosines(np.linspace(0.0, 1.0, POINTS))
-    if one is not None and "2 pi" in terms[chosen[0]][1]:
+    if terms[chosen[0]][1] in sinusoids.get(name, {}):
+        one = periods[name]
         x = np.linspace(*span[name], max(POINTS, int(PER_PERIOD * one.best * np.ptp(span[name]))))
         basis, there = one.columns(natural[name]) * np.mean(size), one.columns(x)
+    else:
+        x, there = np.linspace(*span[name], POINTS), _cosines(np.linspace(0.0, 1.0, POINTS))
+        basis = _cosines(search.at[name]) * size[:, None, None]
     basis = np.where(mask[..., None], basis, 0.0)
     shared = LinearModel(hyper, law.with_amplitudes(basis)).shared()
     covariance = np.linalg.inv(shared.information + np.eye(basis.shape[-1]) / max(unit, 1e-12) ** 2)

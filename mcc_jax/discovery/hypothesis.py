@@ -136,9 +136,15 @@ def fit_with_misfit(base: Base, one: Hypothesis, columns_of: Callable[[Variant, 
 class Discrepancy:
     """A discrepancy common to all particles, smooth or periodic, which no mechanism explains."""
 
-    parts: tuple[np.ndarray, ...]  # functions of each of its parts [um]
+    smooth: tuple[np.ndarray, ...]  # functions of each of its parts [um]
     log_white: float  # logarithm of the standard deviation of white noise, by which they are measured
-    periods: tuple[Periodogram, ...] = ()  # whose sinusoids are the last parts
+    periods: tuple[Periodogram, ...] = ()
+    sinusoids: tuple[np.ndarray, ...] = ()  # of every period, a part each [um]
+
+    @property
+    def parts(self) -> tuple[np.ndarray, ...]:
+        """Functions of all its parts [um]."""
+        return (*self.smooth, *self.sinusoids)
 
     @property
     def sizes(self) -> np.ndarray:

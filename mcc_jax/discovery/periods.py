@@ -66,12 +66,13 @@ def periodograms(natural: Mapping[str, np.ndarray], null: Fitted) -> tuple[Perio
 def _periodogram(name: str, x: np.ndarray, mask: np.ndarray, null: Fitted) -> Periodogram | None:
     span, step = np.ptp(x[mask]), np.abs(np.diff(x))[mask[:, 1:] & mask[:, :-1]]
     fastest = 1 / (READINGS * max(float(np.median(step)), 1e-300))
-    frequency = np.arange(LEAST_PERIODS * OVERSAMPLED, MOST) / (OVERSAMPLED * max(span, 1e-300))
+    apart = 1 / (OVERSAMPLED * max(span, 1e-300))  # frequencies from each other
+    frequency = apart * np.arange(LEAST_PERIODS * OVERSAMPLED, MOST)
     frequency = frequency[frequency <= fastest]
     if not len(frequency):
         return None
     power, information = _against_law(frequency, x, mask, null)
-    near = frequency[np.argmax(power)] + np.linspace(-1, 1, REFINED) * frequency[0] / (LEAST_PERIODS * OVERSAMPLED)
+    near = frequency[np.argmax(power)] + np.linspace(-1, 1, REFINED) * apart
     best = near[np.argmax(_against_law(near, x, mask, null)[0])]
     return Periodogram(name, frequency, power, information, float(best))
 

@@ -170,8 +170,8 @@ class Search:
         """Functions of what no mechanism explains."""
         parts = general(self.at, self.base.tests, self.null.design.linear)
         periods, mask = periodograms(self.natural, self.null), np.asarray(self.base.tests.mask)
-        repeating = [np.where(mask[..., None], one.columns(self.natural[one.coordinate]), 0.0) for one in periods]
-        return Discrepancy((*parts, *repeating), float(self.null.optimum.hyper[0]), periods)
+        sinusoids = (np.where(mask[..., None], one.columns(self.natural[one.coordinate]), 0.0) for one in periods)
+        return Discrepancy(parts, float(self.null.optimum.hyper[0]), periods, tuple(sinusoids))
 
     def fit_discrepancy(self, leader: Hypothesis, at_least: float) -> None:
         """Log evidence of a name with a smooth discrepancy in addition, where it comes near that of another."""

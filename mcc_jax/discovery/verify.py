@@ -34,7 +34,7 @@ class _Statistic:
         variants = {m: len({f for n, f in names if n == m}) for m, _ in names}
         self.weight = -np.log([variants[name[0]] * names.count(name) for name in names])
         self.sizes, self.periods = search.discrepancy.sizes, search.discrepancy.periods
-        parts = search.discrepancy.parts[: len(search.discrepancy.parts) - len(self.periods)]
+        parts = search.discrepancy.smooth
         self.parts = np.repeat(np.arange(len(parts)), [part.shape[-1] for part in parts])
         own = search.candidates.of({name: m for name, m in search.not_shared.items() if not m.sudden})
         self.own_names, self.own_ratio = own.mechanisms, own.largest

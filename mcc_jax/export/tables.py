@@ -244,6 +244,9 @@ def _in_units(columns: Columns, units: Units) -> pd.DataFrame:
     wanted = UNITS[arguments.choice(units, UNITS, "units")]
     named = {}
     for name, values in columns.items():
-        unit, factor = wanted.get(name.removesuffix("_max"), ("", 1))  # path and time_s stay as they are
-        named[f"{name}_{unit}".rstrip("_")] = factor * values
+        if quantity := wanted.get(name.removesuffix("_max")):
+            unit, factor = quantity
+            named[f"{name}_{unit}"] = factor * values
+        else:  # path, time_s
+            named[name] = values
     return pd.DataFrame(named)

@@ -1,9 +1,13 @@
 """The paper's calibration as a whole: what it recovers, what it writes, what it says of data it does not fit."""
 
+import json
+
 import numpy as np
 import pytest
+from helpers import INSTRUMENTS
 
 from mcc_jax import InputError, Instrument, Programme, Ramp, calibrate_paper, paper_campaign
+from mcc_jax.campaign import read_instrument_file
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +75,16 @@ def test_without_unloading_there_is_no_modulus_and_the_rest_stands():
     assert not content["converged"]
     assert any("no unloading" in note for note in content["warnings"])
     assert content["a"]["value"] is not None
+
+
+@pytest.mark.extended
+def test_indentation_of_another_material_runs_and_is_called_badly_described():
+    campaign = read_instrument_file(INSTRUMENTS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0))
+    result = calibrate_paper(campaign, threshold_MPa=0.2)
+    content = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    assert len(content["particles"]) == 10
+    assert len(result.elastic.branches) == 80
+    assert result.own_misfit > 0.05
+    assert any("describes these tests badly" in note for note in content["warnings"])
+    noise = content["noise"]["displacement_um"]["value"]
+    assert all(p["rms_um"] > 100 * noise for p in content["particles"])
