@@ -42,9 +42,6 @@ def modulus(kind):
     return calibrated(kind).answer()["effective_modulus_MPa"]
 
 
-# ---- answers ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.extended
 @pytest.mark.parametrize("kind", ["offset and force", "path", "spiked", "broken"])
 def test_the_modulus_holds_the_truth_and_is_as_sharp_as_the_clean_tests_allow(kind):
@@ -93,9 +90,6 @@ def test_a_broken_particle_is_named_with_the_answer_without_it():
     assert "with it the modulus is" in found.sentence
 
 
-# ---- unlike the others -----------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=50)
 @given(st.integers(0, 2**31 - 1), st.integers(0, 11), st.floats(50, 1e5))
 def test_one_particle_far_from_all_others_is_named(seed, which, times):
@@ -120,9 +114,6 @@ def test_what_is_like_the_others_or_has_none_to_be_unlike(monkeypatch):
     assert unlike_others(*few) is None
     monkeypatch.setattr(judgement, "LEAST", 4)
     assert unlike_others(*few).particles == ("P3",)
-
-
-# ---- the answer without them -----------------------------------------------------------------------------------------
 
 
 def answer(value=16000.0, sd=40.0, *, converged=True):

@@ -338,6 +338,8 @@ def test_a_campaign_takes_lists_and_series():
     for values in (curve.time_s, curve.force_mN, curve.displacement_um):
         assert type(values) is np.ndarray
         assert values.dtype == float
+    same = Curve([0, 1, 2], (0.0, 10.0, 20.0), table["d"].to_numpy())
+    np.testing.assert_array_equal(same.force_mN, curve.force_mN)
 
 
 def test_a_curve_of_unequal_lengths_names_both():

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import Softer
-from test_pair_law import ON_PATH, PARTICLE, UM, cycle, driven, law_of, on_pair, with_all
+from test_pair_law import ON_PATH, PARTICLE, UM, cycle, driven, law_of, on_pair, on_wall, with_all
 
 from benchmarks import energy_paths
-from mcc_jax import InputError, Particle, Unloading
+from mcc_jax import InputError, Particle, Unloading, drive
 from mcc_jax.dem import half_contact, pair_recovery, spheres, wall_energy, wall_force
 from mcc_jax.effects import LIBRARY, AbstractEffect, find_variant
 from mcc_jax.law import StrainScaling
@@ -20,7 +20,14 @@ AT_PEAK = [v for v in CLOSED if v.mechanism in ("damage", "densification_stiffen
 OTHERS = [v for m in LIBRARY.values() for v in m if v not in CLOSED]
 
 
-# ---- physics ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("unloading", [Unloading.PRINTED, Unloading.PUNCH])
+def test_two_halves_are_the_plate_test(unloading):
+    """T1 and T2 with effects: two walls, and two equal particles, give what `drive` gives."""
+    law, displacement = with_all(unloading), cycle(45.0)
+    expected = 1e-3 * drive(law, PARTICLE, displacement, time=np.arange(len(displacement))).force
+    side = half_contact(law, PARTICLE)
+    for force, overlaps in ((on_wall(side), 0.5e-6 * displacement), (on_pair(side, side), 1e-6 * displacement)):
+        assert np.max(np.abs(driven(force, overlaps) - expected)) <= 1e-12 * np.max(expected)
 
 
 @pytest.mark.extended
@@ -110,9 +117,6 @@ def test_what_would_gain_energy_is_refused_and_flagged():
     assert not side.is_valid
     lost = jax.jit(jax.vmap(lambda d: wall_energy(side, d, d).dissipated))(side.tested * jnp.linspace(0.01, 1.0, 200))
     assert np.diff(lost).min() < 0  # it would have gained, indeed
-
-
-# ---- machinery -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("variant", OTHERS, ids=lambda v: v.label)

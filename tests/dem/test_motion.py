@@ -230,9 +230,6 @@ def test_press_release_and_eject():
     assert np.all(np.isfinite(eject.on_wall))
 
 
-# ---- what is refused, what is flagged --------------------------------------------------------------------------------
-
-
 def test_particles_outside_are_named():
     for move, wall in (([0, 0, -1e-3], "wall 0 .Plane"), ([1e-3, 0, 0], "wall 2 .Cylinder")):
         position = loose().position.at[3].add(jnp.asarray(move))
@@ -285,9 +282,6 @@ def test_beyond_the_tested_range_is_said():
     assert rows.beyond_tested[0] > 0
 
 
-# ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
 def harder(pack, log_c1):
     """The packing with every C1 scaled: k1 is proportional to it."""
     sides = eqx.tree_at(lambda s: s.k1, pack.sides, pack.sides.k1 * jnp.exp(log_c1))
@@ -333,9 +327,6 @@ def test_a_run_takes_the_steps_asked_for():
         expected, _ = STEP(packing(), move, expected)
     np.testing.assert_allclose(five.position, expected.position, rtol=0, atol=1e-16)
     assert float(five.time) == pytest.approx(5 * float(move.time_step))
-
-
-# ---- packings and walls ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.extended

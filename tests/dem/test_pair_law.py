@@ -157,9 +157,6 @@ def test_ellipsoid_turns_continuously():
     assert np.all(np.isfinite(slope))
 
 
-# ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
 def pair(unloading=Unloading.PRINTED, effects=False):
     """Two unlike sides, with effects on parameters and modulus or without."""
     other = Particle(60.0, 62.0, 50.0)
@@ -267,9 +264,6 @@ def test_compiled_split_converges(spread_of_sizes):
         np.testing.assert_allclose(WALLS(i, zero, d_i), WALLS(j, zero, d_j), rtol=2e-14)
 
 
-# ---- energy ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("effects", [False, True])
 @pytest.mark.parametrize("unloading", list(Unloading))
 def test_energy_is_the_area_under_the_curve(unloading, effects):
@@ -283,9 +277,6 @@ def test_energy_is_the_area_under_the_curve(unloading, effects):
         work = np.sum(0.5 * (forces[1:] + forces[:-1]) * np.diff(overlaps))
         np.testing.assert_allclose(energy.recoverable + energy.dissipated, work, rtol=2e-5)
         assert energy.recoverable >= 0
-
-
-# ---- what is refused, what is flagged --------------------------------------------------------------------------------
 
 
 def test_forms_do_not_mix():

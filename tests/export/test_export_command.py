@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -128,3 +130,11 @@ def test_bad_input_is_one_line_and_writes_nothing(run, tmp_path, kind):
     (out / "mcc_law.h").write_text("old")
     refused(run("export", folder, "--format", "c", "--out", out, *options))
     assert [p.read_text() for p in out.iterdir()] == ["old"]
+
+
+@pytest.mark.extended
+def test_help_does_not_import_jax():
+    code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import run\n"
+    code += "try:\n    run()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "--allow-not-monotone" in done.stdout

@@ -73,9 +73,6 @@ def largest_gain(response):
     return float(np.max((best - net[released]) / put_in[released]))
 
 
-# ---- physics ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.extended
 @pytest.mark.parametrize(("variant", "unloading"), CASES, ids=lambda one: getattr(one, "label", None))
 @settings(max_examples=10)
@@ -171,9 +168,6 @@ def test_it_is_refused_where_a_particle_code_refuses_it():
     np.testing.assert_array_equal(passive, ours)
 
 
-# ---- other effects ---------------------------------------------------------------------------------------------------
-
-
 def test_other_effects_do_not_hide_it():
     others = ("frame_compliance", "creep", "size_effect", "humidity")
     path, time = jnp.linspace(0.0, load_at_the_end(), 40), jnp.arange(40.0)
@@ -182,9 +176,6 @@ def test_other_effects_do_not_hide_it():
     assert "creep" not in str(caught.value)
     fine = drive(law_of().with_effects(*others, "damage:cyclic"), PARTICLE, path, time=time, control="load")
     assert fine.result == RESULTS.successful
-
-
-# ---- machinery -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.extended
