@@ -11,6 +11,7 @@ from pathlib import Path
 from equations import in_tex
 
 from mcc_jax._format import number, plain
+from mcc_jax.effects import EQUIVALENCES
 
 POWER = json.loads((Path(__file__).parent / "power.json").read_text(encoding="utf-8"))
 FEW, MANY = "unload", "rates"
@@ -241,10 +242,9 @@ def entry(mechanism):
     if first.helps:
         facts.append(f"| Easier to identify with | {_listed(need.value for need in first.helps)} |")
     facts.append(f"| Mistaken for | {mistaken_for(name)} |")
-    if mechanism.equivalences:
-        facts.append(
-            f"| Cannot be distinguished, by tests of force and displacement, from | {_listed(mechanism.equivalences)} |"
-        )
+    equal = [n for e in EQUIVALENCES if any(name in n for n in e.names) for n in e.names if name not in n]
+    if equal:
+        facts.append(f"| Cannot be distinguished, by tests of force and displacement, from | {_listed(equal)} |")
     facts.append(f"| What shows it by itself | {mechanism.check} |")
     sources = list(dict.fromkeys(variant.source for variant in mechanism))
     rows = [

@@ -277,8 +277,9 @@ def is_right(case: Case, found: Mapping[str, Any]) -> bool:
     if found["verdict"] == "UNLISTED":
         return case.or_unlisted or names == {"UNLISTED"}
     sets = [set(s) for s in found["sets"]]
-    if names == {"rate_dependence"} and len(case.rates) == 1 and len(sets) == 1:  # at one rate size looks the same
-        return names <= sets[0] <= names | {"size_effect"}
+    equal = {"rate_dependence", "size_effect"}
+    if names <= equal and len(case.rates) == 1 and len(sets) == 1:  # equivalent by construction: declared is right
+        return names <= sets[0] <= equal
     return len(sets) == len(names) and {s[0] for s in found["sets"]} == names
 
 

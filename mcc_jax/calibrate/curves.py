@@ -167,8 +167,7 @@ def fitted_curves(
     predictions: Callable[[str], np.ndarray | None],
     variants: Variants | None = None,
 ) -> tuple[FittedCurve, ...]:
-    """The tests of a campaign with what its calibrated law predicts; `compared` and `predictions` are those of a
-    `Calibration`."""
+    """Tests with what a calibrated law predicts; `compared` and `predictions` are those of a `Calibration`."""
     segments = campaign_segments(campaign)
     curves, rows = _measured(campaign, segments, compared)
     entry_by_name = {entry["particle"]: entry for entry in content["particles"]}

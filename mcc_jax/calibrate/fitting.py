@@ -167,8 +167,7 @@ class _Fitter:
         self.marginal, self.filters, self.white = self.summaries(self.point, self.linear)
 
     def take_noise(self, *, uncertainty: bool) -> None:
-        """The noise of what the particles leave, with weights of readings and the particles' own scales; summaries
-        under it."""
+        """Noise of what particles leave, with weights of readings and scales of particles; summaries under it."""
         self.estimate_noise(uncertainty)
         self.summarise()
         for _ in range(STUDENT_STEPS if self.model.robust else 0):

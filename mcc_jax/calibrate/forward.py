@@ -217,8 +217,7 @@ class Straight(eqx.Module):
 def coordinates(
     theta: Float[Array, " numbers"], at: Float[Array, " numbers"], straight: Straight, places: Places
 ) -> tuple[Float[Array, " numbers"], Float[Array, " numbers"]]:
-    """Coordinates of one particle's numbers, linearised `at` others, and the factor that each amplitude has in its
-    own."""
+    """Coordinates of a particle's numbers, linearised `at` others, and the factor of each amplitude in its own."""
     away, factor = theta - at, jnp.ones_like(theta)
     for k, amplitude in places:
         x, q = jnp.log(theta[k] / at[k]), straight.power[k]
@@ -308,8 +307,7 @@ class Linearisation:
         return replace(linear, columns=jnp.asarray(columns))
 
     def _bend(self, point: Point, number: int, step: float) -> np.ndarray:
-        """Derivative of all columns by one of the effects' numbers, as in `Marginal`, by differences over a step; 0 for
-        a step of 0."""
+        """Derivative of all columns by an effect's number, as in `Marginal`, by differences; 0 for a step of 0."""
         size = point.theta.shape[1]
         if not step:
             return np.zeros((*self._tests.mask.shape, 4 + size))

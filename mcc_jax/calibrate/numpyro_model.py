@@ -212,8 +212,7 @@ class Model:
         return {v.mechanism: k for k, v in enumerate(self.effects) if v.mechanism in self.varying}
 
     def spread_prior(self, variant: Variant) -> NakagamiPrior:
-        """Prior of how much an amplitude, or its logarithm, differs between particles; open in its order of
-        magnitude."""
+        """Prior of how much an amplitude, or its logarithm, differs between particles: open in its magnitude."""
         return NakagamiPrior(variant.plausible[1] if self._signed(variant) else 0.5, shape=0.25)
 
     @staticmethod

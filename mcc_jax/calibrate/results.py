@@ -159,8 +159,7 @@ class Calibration(Saved):
         raise NotImplementedError
 
     def judged(self, started: float, again: Callable[[Campaign], Calibration] | None) -> Any:
-        """The same with findings, see `judgement.judged`, and the time it took since it was started; `again` calibrates
-        a campaign."""
+        """The same with findings, see `judgement.judged`, and the time it took; `again` calibrates a campaign."""
         answer_without = None if again is None else lambda some: again(some).answer()
         findings = judged(self.campaign, self.answer(), unlike_others(*self._own_residuals()), answer_without)
         return replace(self, findings=findings, runtime_s=time.perf_counter() - started)
@@ -174,8 +173,7 @@ class Calibration(Saved):
         ]
 
     def summary(self) -> pd.DataFrame:
-        """Value, standard deviation and ends of the 95 % interval (columns) of the law's parameters (rows); NaN if
-        unknown."""
+        """Value, standard deviation and 95 % interval (columns) of the law's parameters (rows); NaN if unknown."""
         import pandas as pd
 
         rows = {}
@@ -241,8 +239,7 @@ class JointCalibration(Calibration):
         return {place: (rows, used[: len(rows)]) for place, rows, used in both}
 
     def residual(self) -> np.ndarray:
-        """Measured less predicted displacement [um] at the most probable parameters, shape (N, points), 0 where
-        masked."""
+        """Measured less predicted displacement [um] at the mode, shape (N, points), 0 where masked."""
         return np.asarray(self.fit.residual)
 
     def rms_um(self) -> np.ndarray:

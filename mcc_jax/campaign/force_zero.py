@@ -163,8 +163,7 @@ def _inflation(scatter: np.ndarray) -> float:
 
 
 def _air_until(curve: Curve, control: Control | None) -> tuple[int | None, float]:
-    """How many readings were taken before contact; if too few, None, and what may be a drift of force [mN] before
-    loading."""
+    """Number of readings before contact; if too few, None, and what may be a drift of force [mN] before it."""
     contact = contact_index(find_segments(curve, control=control))
     if contact > AIR_READINGS:
         return contact, 0.0

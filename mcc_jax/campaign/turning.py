@@ -145,8 +145,7 @@ def _run(near: np.ndarray, start: int, stop: int, direction: int) -> np.ndarray:
 
 
 def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.ndarray | None:
-    """Rows of a hold whose readings scatter about one force, without readings of the ramps next to it; None where the
-    force relaxes."""
+    """Rows of a hold at one force, without readings of the ramps next to it; None where the force relaxes."""
     force = raw[part.start : part.stop]
     away = np.abs(force - median(force))
     sd = 1.4826 * median(away)

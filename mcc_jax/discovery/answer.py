@@ -18,6 +18,8 @@ from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..calibrate.forward import Forms
 from ..calibrate.population import COEFFICIENTS
+from ..campaign import available_data
+from ..effects import EQUIVALENCES
 from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD, Record
 from ..geometry import Particle
 from .base import Base
@@ -186,7 +188,10 @@ def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
 
 
 def sets_of(search: Search, leader: Names, effects: Sequence[Effect], pairs: Sequence[Names]) -> tuple[Names, ...]:
-    """For each effect that was added, itself and what may be in its place, most probable first, `pairs` last."""
+    """For each effect that was added, itself and what may be in its place, most probable first, `pairs` last; with what
+    is equivalent by construction in these tests, however one formula compares to another."""
+    present = available_data(search.base.campaign)
+    equal = [set(e.names) for e in EQUIVALENCES if e.need is not None and e.need not in present]
     alike = {names: one for names, one in search.found.items() if len(names) == len(leader) and names != UNLISTED}
     found = []
     for effect in effects:
@@ -200,6 +205,7 @@ def sets_of(search: Search, leader: Names, effects: Sequence[Effect], pairs: Seq
             if held < DECISIONS.set_mass:
                 members.append(name)
                 held += share
+        members += [n for n in search.library if n not in others and any({n, effect.mechanism} <= e for e in equal)]
         found.append(tuple(dict.fromkeys([*members, *(n for pair in pairs for n in pair)])))
     return tuple(found)
 

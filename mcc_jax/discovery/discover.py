@@ -236,14 +236,18 @@ def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
         if alone.log_evidence < search.null.log_evidence + STRONG:
             return None
         search.progress("the same in the law's other form of unloading")
+        base = replace(base, state=alone.state, hyperparameters=alone.optimum.hyper)
         other = Search(base, search.library, search.whole, search.progress)
+        leader = next(names for names in search.log_posteriors() if names)
+        if not other.comes_near(leader, max(one.alone for one in search.found.values())):
+            return None
     _run(other, seed)
     best, other_best = (max(one.log_posteriors().values()) for one in (search, other))
     if other_best < best + STRONG:
         return None
-    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r}"
+    gain = f"(log evidence larger by {other_best - best:.0f})"
+    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r} {gain}"
     remedy = f"Calibrate in this form, Model(unloading={form.value!r}): the modulus belongs to it"
-    text = f"{text} (log evidence larger by {other_best - best:.0f})"
     found = Finding("form of unloading", "warning", text, remedy, code=FORM)
     other.untestable, other.left_out = search.untestable, [found, *search.left_out]
     return other

@@ -328,6 +328,15 @@ class Search:
         self.other_noise()
         return self
 
+    def comes_near(self, leader: Names, log_evidence: float) -> bool:
+        """Whether nothing, what leads to first order, or another search's leader begins near a log evidence, or may."""
+        best = {m: max(each.values()) for m, each in self.first_order.items()}
+        if not best or not set(leader) <= set(best):
+            return True
+        rows = [(best[m][1],) for m in leader] + [(max(best.values())[1],), *list(self.leading_pairs().values())[:1]]
+        fits = side_by_side(self.fit, list(dict.fromkeys(rows)))
+        return max(one.log_evidence for one in (self.null, *fits)) > log_evidence - VERY_STRONG
+
     def pairs_of(self, leaders: Sequence[Hypothesis]) -> None:
         """The best second names next to each of some leaders, and what leads of all pairs to first order."""
         for leader in leaders:

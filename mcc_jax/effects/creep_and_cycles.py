@@ -333,6 +333,5 @@ RATCHETING = family(Ratcheting, "ratcheting",
         parameter="ratchet_share", plausible=(5e-4, 3e-2)),
     parameter="ratchet_strain", plausible=(2e-4, 1e-2), needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD,),
     source="Johnson (1985), Contact Mechanics, sec. 9.2; Kadin, Kligerman and Etsion (2006)",
-    equivalences=("creep, as long as there is one reload only and no hold",),
     check="cycle one particle ten times or more to the same load", coordinates=("cycles", "peak", "reload"),
 )  # fmt: skip

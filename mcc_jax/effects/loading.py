@@ -103,7 +103,7 @@ RATE = family(RateDependence, "rate_dependence",
         source=_EYRING, formula="eyring", terms=_YIELD),
     formula="logarithm", parameter="rate_sensitivity", plausible=(0.003, 0.1),
     source="Roberts and Rowe (1985), Chem. Eng. Sci. 40, 4; Schmalbach et al. (2021), J. Mater. Res.",
-    helps=(Need.SEVERAL_SIZES,), equivalences=("size_effect, at one force rate",),
+    helps=(Need.SEVERAL_SIZES,),
     check="load at two rates or more within one class of sizes", coordinates=("peak", "rate", "stress_rate"),
 )  # fmt: skip
 
@@ -282,7 +282,6 @@ TOE = family(Toe, "toe_asperity",
     parameter="toe_strain", plausible=(5e-4, 2e-2), needs=(Need.LOW_LOAD,), helps=(Need.RELOAD,),
     source="Greenwood and Williamson (1966), Proc. R. Soc. A 295, 300",
     nuisances=(Nuisance("stress_scale_MPa", _FLATTENING, (0.01, 20.0), "stress that flattens most of them"),),
-    equivalences=("zero of displacement, where the toe lies below all data",),
     check="measure how rough particles and platens are; on a reload asperities stay flat", coordinates=("peak", "load"),
 )  # fmt: skip
 
@@ -346,7 +345,6 @@ POP_IN = family(PopIn, "pop_in",
     source="Antonyuk et al. (2005), Granular Matter 7, 29; Jonsson and Frenning (2016); Cooper et al. (2020)",
     nuisances=(Nuisance("location_MPa", (1.0, 2.0, 4.0, 7.0), (0.3, 16.0), "stress at which it breaks",
                         random_per_test=True),),
-    equivalences=("the law's own snap-through, where a loading curve is not monotone",),
     check="watch the particle from the side, or listen to it, while the step occurs", coordinates=("peak",),
     sudden=True,
 )  # fmt: skip

@@ -157,7 +157,6 @@ class Mechanism:
 
     Attributes:
         variants: its formulas, the most common first.
-        equivalences: what no data of this kind can distinguish from it; to be declared, never discovered.
         check: what would show it by itself, in addition to what more tests of the same kind would show.
         coordinates: names of what its formulas depend on, and may be wrong in (`mcc_jax.discovery.misfit`).
         opposite: the mechanism that is this one with the other sign: the two are no pair.
@@ -167,7 +166,6 @@ class Mechanism:
     name: str
     explanation: str
     variants: tuple[Variant, ...]
-    equivalences: tuple[str, ...] = ()
     check: str = ""
     coordinates: tuple[str, ...] = ("peak", "load", "since")
     opposite: str = ""
@@ -233,6 +231,7 @@ class Equivalence:
     names: tuple[str, ...]
     explanation: str
     broken_by: str
+    need: Need | None = None  # the data that distinguish two mechanisms; without it an answer has both in its set
 
     __repr__ = described()
 
@@ -244,19 +243,20 @@ EQUIVALENCES = (
     Equivalence(("zero of force", "zero of displacement"),
         "A small shift of force at first contact moves the curve along itself, as a shift of displacement does.",
         "a record of the approach before contact"),
-    Equivalence(("shape parameter a", "mean of C1, C3 and C5"),
-        "If all particles have the same flatness, a multiplies all coefficients by one number.",
+    Equivalence(("shape parameter a or shape_second_order", "mean of C1, C3 and C5"),
+        "If all particles have the same flatness, each multiplies all coefficients by one number.",
         "particles of several shapes"),
     Equivalence(("thermal_drift linear", "frame_compliance linear, on loading at one rate"),
         "While force grows in proportion to time, both add displacement in proportion to force.",
         "unloading, a hold, or a second rate"),
-    Equivalence(("damage", "densification_stiffening of opposite sign"),
-        "One says that the modulus falls with peak strain, the other that it grows; the sign decides between them.",
-        "nothing is needed: amplitudes below zero are not physical"),
-    Equivalence(("rate_dependence", "size_effect, at one force rate"),
-        "At one force rate the strain rate goes as the inverse square of size.", "two rates in one class of size"),
-    Equivalence(("finite width of the punch", "nothing"),
-        "As long as no contact is wider than the punch, its width changes nothing.",
-        "particles whose contact outgrows the punch"),
+    Equivalence(("rate_dependence", "size_effect"),
+        "At one force rate the strain rate goes as the inverse square of size.", "two rates in one class of size",
+        Need.TWO_RATES),
+    Equivalence(("toe_asperity, below all data", "zero of displacement"),
+        "Asperities that are flat before the first reading shift the whole curve.", "a record from the first contact"),
+    Equivalence(("pop_in", "snap-through of the law"),
+        "A law whose loading curve is not monotone steps by itself.", "several sizes: its own step is at one strain"),
+    Equivalence(("ratcheting, with one reload and no hold", "creep"),
+        "Within one cycle, time and the number of loads grow together.", "a hold, or a second reload"),
 )  # fmt: skip
 """What must be declared and can never be discovered."""

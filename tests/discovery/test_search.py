@@ -7,13 +7,14 @@ import pytest
 from campaigns import base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
-from mcc_jax.discovery import screen, verify
+from mcc_jax.discovery import answer, screen, verify
 from mcc_jax.discovery.answer import effects_of, instead_of, population_under, sets_of
 from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
 from mcc_jax.discovery.hypothesis import Hypothesis
+from mcc_jax.discovery.result import Effect
 from mcc_jax.discovery.search import Search
 from mcc_jax.discovery.settings import DECISIONS, UNLISTED, VERY_STRONG
-from mcc_jax.effects import LIBRARY
+from mcc_jax.effects import LIBRARY, Need, find_variant
 
 pytestmark = pytest.mark.extended
 
@@ -96,6 +97,24 @@ def test_two_names_short_of_the_margin_in_place_of_one_make_a_set(named, lead, t
         (names,) = sets_of(named, leader, effects, pairs)
         assert names == ((*leader, *pair) if told else leader)
         assert (effect.probability > 0.9) is not told
+
+
+@pytest.mark.parametrize("present", [(), (Need.TWO_RATES,)])
+def test_at_one_rate_rate_and_size_are_in_one_set_whatever_the_evidence(named, present, monkeypatch):
+    names = "rate_dependence", "size_effect"
+    monkeypatch.setattr(answer, "available_data", lambda _: frozenset(present))
+    found = {(name,): Hypothesis((name,), 100.0 * k, 100.0 * k) for k, name in enumerate(names)}
+    monkeypatch.setattr(named, "found", found)
+    monkeypatch.setattr(named, "library", LIBRARY)
+    effect = Effect(find_variant("size_effect"), {}, 0.3, 0.01, 1.0, 0.0)
+    assert sets_of(named, names[1:], [effect], ()) == (names[1:] if present else names[::-1],)
+
+
+def test_another_form_is_searched_where_it_begins_near(named):
+    best, leader = max(h.alone for h in named.found.values()), ("frame_compliance",)
+    assert named.comes_near(leader, best)
+    assert not named.comes_near(leader, best + 2 * VERY_STRONG)
+    assert named.comes_near(UNLISTED, best + 2 * VERY_STRONG)  # not known before it is searched
 
 
 def test_a_second_name_has_an_amplitude_that_one_would_believe(named, with_pair):
