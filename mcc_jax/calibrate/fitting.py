@@ -142,8 +142,8 @@ class _Fitter:
     def begin(self, read_out_um: float) -> dict[str, float]:
         """Every particle on its own, and from which values of the model's sites to look for the population."""
         model, N = self.model, len(self.tests)
-        theta = np.broadcast_to(model.forms.without_effects, (N, len(model.forms.names)))
-        self.individual = self.alone(np.full(N, read_out_um), theta)
+        base = _Fitter(self.tests, replace(model, effects=(), varying=()), self.progress)
+        self.individual = base.alone(np.full(N, read_out_um), np.zeros((N, 0)))
         noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
         self.noise = NoiseFit(noise, converged=True)
         theta = np.zeros(0)
