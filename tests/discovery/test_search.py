@@ -103,8 +103,7 @@ def test_two_names_short_of_the_margin_in_place_of_one_make_a_set(named, lead, t
 def test_at_one_rate_rate_and_size_are_in_one_set_whatever_the_evidence(named, present, monkeypatch):
     names = "rate_dependence", "size_effect"
     monkeypatch.setattr(answer, "available_data", lambda _: frozenset(present))
-    found = {(name,): Hypothesis((name,), 100.0 * k, 100.0 * k) for k, name in enumerate(names)}
-    monkeypatch.setattr(named, "found", found)
+    monkeypatch.setattr(named, "found", {(n,): Hypothesis((n,), 100.0 * k, 100.0 * k) for k, n in enumerate(names)})
     monkeypatch.setattr(named, "library", LIBRARY)
     effect = Effect(find_variant("size_effect"), {}, 0.3, 0.01, 1.0, 0.0)
     assert sets_of(named, names[1:], [effect], ()) == (names[1:] if present else names[::-1],)
