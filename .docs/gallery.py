@@ -242,7 +242,13 @@ def entry(mechanism):
     if first.helps:
         facts.append(f"| Easier to identify with | {_listed(need.value for need in first.helps)} |")
     facts.append(f"| Mistaken for | {mistaken_for(name)} |")
-    equal = [n for e in EQUIVALENCES if any(name in n for n in e.names) for n in e.names if name not in n]
+    equal = [
+        f"{other}, without {e.need.value}" if e.need else other
+        for e in EQUIVALENCES
+        if any(name in one for one in e.names)
+        for other in e.names
+        if name not in other
+    ]
     if equal:
         facts.append(f"| Cannot be distinguished, by tests of force and displacement, from | {_listed(equal)} |")
     facts.append(f"| What shows it by itself | {mechanism.check} |")
