@@ -75,7 +75,7 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
 
     def columns(variants: tuple[Any, ...]) -> np.ndarray:
         forms = Forms(unloading, variants)
-        start = jnp.asarray(forms.without_effects)
+        start = jnp.array([0.0] * len(variants) + [n.middle for v in variants for n in v.nuisances])
         point = Point(latent, zero, jnp.broadcast_to(start, (len(latent), len(start))))
         return np.asarray(linearise(point, tests, forms).columns)[:count]
 

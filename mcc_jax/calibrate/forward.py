@@ -53,11 +53,6 @@ class Forms(eqx.Module):
         return (*(v.mechanism for v in self.effects), *further)
 
     @property
-    def without_effects(self) -> np.ndarray:
-        """Numbers with which the effects change nothing: amplitudes of zero, further numbers in their middle."""
-        return np.array([0.0] * len(self.effects) + [n.middle for v in self.effects for n in v.nuisances])
-
-    @property
     def positive(self) -> np.ndarray:
         """Which of the further numbers must be positive, and are fitted by their logarithm."""
         return np.array([n.plausible[0] > 0 for v in self.effects for n in v.nuisances], bool)

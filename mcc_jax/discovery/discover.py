@@ -124,7 +124,7 @@ def discover(
     )
     if not search.is_gap:
         return _finished(_of_law_alone(found, search), findings, started)
-    winner = next(names for names in search.log_posteriors() if names)
+    winner = search.leader
     if confirm and len(base.tests) >= LEAST:
         progress("held-out particles")
         held = held_out(search, winner)
@@ -238,8 +238,7 @@ def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
         search.progress("the same in the law's other form of unloading")
         base = replace(base, state=alone.state, hyperparameters=alone.optimum.hyper)
         other = Search(base, search.library, search.whole, search.progress)
-        leader = next(names for names in search.log_posteriors() if names)
-        if not other.comes_near(leader, max(one.alone for one in search.found.values())):
+        if not other.comes_near(search.leader, max(one.alone for one in search.found.values())):
             return None
     _run(other, seed)
     best, other_best = (max(one.log_posteriors().values()) for one in (search, other))

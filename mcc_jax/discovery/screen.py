@@ -167,6 +167,7 @@ class Screen:
         each = single_integrals(self.score, information, self.candidates.signs, self.candidates.largest)
         return np.max(self.log_null[:, None] + each, 0)
 
+    @cached_property
     def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Candidates of every two mechanisms, first and second, and their log marginal likelihood."""
         a, b = np.triu_indices(len(self.candidates.each), 1)

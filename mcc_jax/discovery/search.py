@@ -73,6 +73,11 @@ class Search:
         return _best_first({n: v for n, v in logs.items() if len(n) < 2 or v > fewer + DECISIONS.margin})
 
     @property
+    def leader(self) -> Names:
+        """The most probable hypothesis by which something is missing."""
+        return next(names for names in self.log_posteriors() if names)
+
+    @property
     def is_gap(self) -> bool:
         """Whether anything is missing."""
         return self.p_any < DECISIONS.level and self.posterior()[()] < 0.5
@@ -234,7 +239,7 @@ class Search:
 
     def leading_pairs(self) -> dict[Names, tuple[int, ...]]:
         """The best pairs to first order that lead every single name: of two strong effects neither need lead alone."""
-        a, b, value = self.screen.pairs()
+        a, b, value = self.screen.pairs
         least = self.screen.singles().max() + DECISIONS.margin
         found: dict[Names, tuple[int, ...]] = {}
         for k in np.argsort(-value):

@@ -182,7 +182,7 @@ def test_formulas_of_the_modulus_agree_at_the_peaks():
 
 
 def test_pairs_to_first_order_are_of_two_mechanisms(named, monkeypatch):
-    a, b, value = named.screen.pairs()
+    a, b, value = named.screen.pairs
     mechanisms = named.screen.candidates.mechanisms
     assert np.all(mechanisms[a] != mechanisms[b])
     # A second amplitude that explains nothing costs a little of the evidence that the first has alone.
