@@ -129,11 +129,9 @@ class _Fitter:
 
     def begin_at(self, start: Start) -> dict[str, float]:
         """Particles and noise of another fit, and its values of the model's sites."""
-        point, self.noise = start.point, NoiseFit(start.noise, converged=True)
-        own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, self.varying]])
-        white = np.exp(np.asarray(start.noise.logs)[0]) * np.asarray(start.noise.scale)
-        self.individual = self.alone(white, point.theta, own[:, None])
-        self.point, self.linear = point, self.linearisation.at(point)
+        self.noise = NoiseFit(start.noise, converged=True)
+        self.individual = self.alone(start.point)
+        self.point, self.linear = start.point, self.linearisation.at(start.point)
         one = jax.tree.map(lambda x: np.asarray(x)[None], start.population)
         known = coordinates_of(one, self.model)
         values = population_sites(self.model, np.asarray(self.tests.flatness), known).values
@@ -142,15 +140,16 @@ class _Fitter:
     def begin(self, read_out_um: float) -> dict[str, float]:
         """Every particle on its own, and from which values of the model's sites to look for the population."""
         model, N = self.model, len(self.tests)
-        base = _Fitter(self.tests, replace(model, effects=(), varying=()), self.progress)
-        self.individual = base.alone(np.full(N, read_out_um), np.zeros((N, 0)))
         noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
         self.noise = NoiseFit(noise, converged=True)
-        theta = np.zeros(0)
+        base = _Fitter(self.tests, replace(model, effects=(), varying=()), self.progress)
+        base.noise, theta = self.noise, np.zeros(0)
+        self.individual = base.alone()
         if model.effects:
-            theta = start_of_effects(self.individual.point, self.tests, noise, model, self.blocks)
-        here = np.where(np.arange(len(theta)) < len(model.effects), 0.0, theta)  # first around amplitudes of 0
-        self.point = replace(self.individual.point, theta=jnp.asarray(np.broadcast_to(here, (N, len(here)))))
+            law = self.individual.point
+            theta = start_of_effects(law, self.tests, noise, model, self.blocks)
+            self.individual = self.alone(replace(law, theta=jnp.asarray(np.tile(theta, (N, 1)))))
+        self.point = self.individual.point
         self.linear = self.linearisation.at(self.point)
         return _start(np.asarray(self.individual.point.latent), np.asarray(self.tests.flatness), theta, model)
 
@@ -224,14 +223,18 @@ class _Fitter:
         shared = self.model.forms, tuple(self.varying), self.blocks.size
         return self.blocks.share(fit_particles, of_particles, *shared)
 
-    def alone(self, white: np.ndarray, theta: Any, starts: np.ndarray | None = None) -> ParticleFits:
-        """Every particle on its own, the effects' numbers held."""
-        varying, middle = np.asarray(theta)[:, self.varying], _centre(self.model.chosen_priors)
-        centre = np.column_stack([np.tile(middle, (len(varying), 1)), self.zero_mean, varying])
-        zero_sd = self.model.chosen_priors.zero_um.sd
+    def alone(self, point: Point | None = None) -> ParticleFits:
+        """Every particle on its own, from this point on, the effects' numbers held; from nothing without effects."""
+        middle, N = _centre(self.model.chosen_priors), len(self.tests)
+        theta = np.zeros((N, 0)) if point is None else np.asarray(point.theta)
+        varying, zero_sd = theta[:, self.varying], self.model.chosen_priors.zero_um.sd
+        if point is None:
+            starts = linear_starts(self.tests, middle[3])
+        else:
+            starts = np.column_stack([point.latent, point.zero, varying])[:, None]
+        centre = np.column_stack([np.tile(middle, (N, 1)), self.zero_mean, varying])
         width = np.broadcast_to([ALONE] * 4 + [zero_sd] + [1e-12] * len(self.varying), centre.shape)
-        if starts is None:
-            starts = np.pad(linear_starts(self.tests, middle[3]), ((0, 0), (0, 0), (0, len(self.varying))))
+        white = np.exp(np.asarray(self.noise.noise.logs)[0]) * np.asarray(self.noise.noise.scale)
         return self.particles(white, centre, width, theta, starts)
 
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
@@ -273,12 +276,11 @@ def fit_tests(
 ) -> Fit:
     """Fit particles, noise and population, from a first guess of the noise of displacement from point to point [um].
 
-    Particles come first, each on its own. Then, in `rounds` turns at least: the noise from residuals linear in the
-    particles' numbers, the most probable population under the summaries, the most probable particles under that
-    population. With a start the last turn is the only one, unless the tests want more. The noise is what is left under
-    the model at hand: with effects it is not estimated before they are in, and every further step is halved until the
-    tests are more probable where it ends (`_Fitter.step`). Noise that is not `correlated` is white, see
-    `take_white_noise`.
+    Particles come first, each on its own, with effects at their amplitudes to first order. Then, in `rounds` turns at
+    least: the noise from residuals linear in the particles' numbers, the most probable population under the summaries,
+    the most probable particles under that population. With a start the last turn is the only one, unless the tests want
+    more. With effects every step but the first is halved until the tests are more probable where it ends
+    (`_Fitter.step`). Noise that is not `correlated` is white, see `take_white_noise`.
     """
     check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
     effects, count = bool(model.effects), len(tests)
@@ -290,7 +292,7 @@ def fit_tests(
         last = turn >= (max(rounds, MOST_ROUNDS) if effects else rounds)
         if not correlated:
             fitter.take_white_noise()
-        elif (last and turn > begun) or (effects and not turn):
+        elif last and turn > begun:
             fitter.summarise()
         else:  # with effects no round knows that it is the last
             fitter.take_noise(uncertainty=effects or turn >= rounds - 1)
@@ -299,8 +301,6 @@ def fit_tests(
         before = target.unconstrain(first) if free is None else free
         target = careful_enough(before, target, count)
         free, covariance, mode_converged = most_probable(before, target)
-        if effects and not turn:  # amplitudes of zero say nothing about further numbers
-            free = jnp.where(jnp.asarray(["." in name for name in target.names]), before, free)
         gain = _density(free, target) - _density(before, target) if effects else 0.0
         finished = turn >= rounds and (not effects or gain < LEAST_GAIN)
         if last or finished:
