@@ -228,10 +228,8 @@ class _Fitter:
         middle, N = _centre(self.model.chosen_priors), len(self.tests)
         theta = np.zeros((N, 0)) if point is None else np.asarray(point.theta)
         varying, zero_sd = theta[:, self.varying], self.model.chosen_priors.zero_um.sd
-        if point is None:
-            starts = linear_starts(self.tests, middle[3])
-        else:
-            starts = np.column_stack([point.latent, point.zero, varying])[:, None]
+        own = None if point is None else np.column_stack([point.latent, point.zero, varying])
+        starts = linear_starts(self.tests, middle[3]) if own is None else own[:, None]
         centre = np.column_stack([np.tile(middle, (N, 1)), self.zero_mean, varying])
         width = np.broadcast_to([ALONE] * 4 + [zero_sd] + [1e-12] * len(self.varying), centre.shape)
         white = np.exp(np.asarray(self.noise.noise.logs)[0]) * np.asarray(self.noise.noise.scale)

@@ -289,8 +289,7 @@ class SpreadCoordinate(dist.Distribution):
 
 class Amplitude(dist.Distribution):
     """The amplitude of an effect in units of the smallest plausible one, along its physical sign: an equal mixture of
-    normal distributions, cut off at 0 if of one sign, with scales even in the logarithm up to the largest plausible
-    one."""
+    normal distributions, cut off at 0 if of one sign, scales even in the logarithm up to the largest plausible."""
 
     arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
 

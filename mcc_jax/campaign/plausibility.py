@@ -27,6 +27,7 @@ SPREAD = 0.2  # least standard deviation, in decades, between particles of one c
 # How often D3 is the smallest, middle and largest diameter; of the paper's 20 particles 17, 3 and 0
 RANK_AT_REST = (0.80, 0.15, 0.05)
 BEYOND = 3.0  # factor beyond the ranges of all solids, themselves uncertain by about as much, that no solid reaches
+NO_SOLID = "fitted modulus"  # the `check` of the finding that no solid has the modulus of a fit
 # Factor of stress against Avicel PH-200 beyond which another material is reported; its particles scatter by 1.35
 STIFFER = 3.0
 
@@ -298,7 +299,7 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
         f" {high / 1e3:g} GPa), although the tests look like those of an ordinary solid, {own}"
     )
     remedy = "Do not use it: the fitted form of unloading is not that of these tests; another form may be"
-    return [Finding("fitted modulus", "error", sentence, remedy)]
+    return [Finding(NO_SOLID, "error", sentence, remedy)]
 
 
 def _material(tests: _Tests) -> Material | None:

@@ -16,11 +16,12 @@ from .._types import Progress
 from ..calibrate import Model, sample
 from ..calibrate.data import ranges_um, root_mean_squares
 from ..calibrate.fitting import checked_settings
-from ..calibrate.judgement import LEAST_LEFT, numbers_in_reach, unlike_others
+from ..calibrate.judgement import LEAST_LEFT, is_unknown, numbers_in_reach, unlike_others
 from ..calibrate.running import one_blas_thread
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import named
 from ..campaign.force_zero import open_zero
+from ..campaign.plausibility import NO_SOLID
 from ..effects import LIBRARY, Mechanism
 from ..law import Unloading
 from . import answer
@@ -319,6 +320,10 @@ def _sampled(found: Discovery, search: Search, winner: Names) -> Discovery:
 
 def _finished(found: Discovery, findings: Sequence[Finding], started: float) -> Discovery:
     """The answer with findings, its sentence and the time it took."""
+    modulus = (found.parameters_after or found.parameters_before).get("effective_modulus_MPa")
+    if found.base is not None and modulus is not None and not is_unknown(modulus):
+        fitted = check_plausibility(found.base.campaign, modulus_MPa=modulus["value"])
+        findings = (*findings, *(one for one in fitted if one.check == NO_SOLID))
     found = replace(found, findings=tuple(findings), notes=(*map(str, findings), *found.notes))
     summary = found.summary or summary_of(found)
     return replace(found, summary=summary, runtime_s=time.perf_counter() - started)

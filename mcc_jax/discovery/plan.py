@@ -140,8 +140,7 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
 
     Each name is taken for true in turn, as it was fitted. The log Bayes factor over a rival, whose amplitude is fitted
     again, is normal with mean m/2 and variance m, m the squared signature that the rival's leaves; these tests and the
-    further ones add up. `power` is the probability that it exceeds the odds which a single name needs, for the worst
-    rival.
+    further ones add up. `power` is the probability, for the worst rival, that it exceeds the odds a single name needs.
     """
     members = [n for n in names if n in search.shared and search.found[(n,)].at is not None]
     if len(members) < 2:

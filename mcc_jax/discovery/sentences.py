@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._format import interval, listed, plain, with_sd
 from ..calibrate.judgement import is_unknown
+from ..campaign.plausibility import NO_SOLID
 from .settings import AT_PEAKS, DECISIONS, ENOUGH, WITHIN
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 NOTHING_MISSING = "nothing missing"
 FORM = "form"  # code of the finding that the tests follow another form of unloading than was asked for
+TAKEN = "It describes what unloading tells of the effective modulus, too: what is left of that is of no solid."
 JUMPS, CHECKS = 5, 3  # sudden steps and checks that a summary lists
 
 
@@ -81,7 +83,8 @@ def summary_of(found: Discovery) -> str:
         text = f"In addition, a share of the evidence may be due to {listed(each, 'or')}; that is not added to the law."
         sentences.append(text)
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
-        sentences.append(_modulus(found.parameters_before, found.parameters_after))
+        no_solid = any(one.check == NO_SOLID for one in found.findings)
+        sentences.append(TAKEN if no_solid else _modulus(found.parameters_before, found.parameters_after))
     sentences += next_tests(found.next_experiments, found.checks)
     if found.untestable:
         needs = "; ".join(f"{plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)

@@ -134,8 +134,7 @@ class HeldOut:
         """Why what was found cannot be the answer, going by held-out particles; None if nothing speaks against it.
 
         Not that it helps little, as weak effects do, but that it harms, by the log predictive density or by the sign
-        test of root mean square residuals `rms_um` at every step; or that tests are still missed by much of their
-        range.
+        test of root mean square residuals `rms_um` at every step; or that tests are missed by much of their range.
         """
         from scipy.stats import binomtest
 

@@ -32,8 +32,7 @@ class AbstractEffect(eqx.Module):
 
     Attributes:
         closed: whether all it does is a formula of particle and peak, without time, cycles or humidity: `modify` of the
-            particle alone, or an `AbstractModulusAtPeak`. Energy, particle codes and exports take those only. Set it on
-            the class.
+            particle alone, or an `AbstractModulusAtPeak`. Energy, particle codes and exports take only those classes.
         formulas: where the hooks of several formulas differ in one expression, these by name: functions of the effect
             and of what its hook gives them. Set it on the class.
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.

@@ -235,8 +235,7 @@ class Toe(AbstractEffect):
     """Asperities that are flattened at low stress; the amplitude is their height over D_e.
 
     A formula is the share flattened at x = stress over the scale that flattens most of them. Those without an end are 1
-    at x = 9: their amplitude is the height flattened per decade of stress. On unloading asperities stay flat, or spring
-    back with `springs`.
+    at x = 9: their amplitude is the height flattened per decade of stress. Asperities spring back only with `springs`.
     """
 
     stress_scale_MPa: Scalar

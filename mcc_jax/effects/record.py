@@ -61,8 +61,7 @@ class Record(eqx.Module):
         loading_rate: the same of the latest loading or reloading ramp [mN/s].
         relative_humidity: relative humidity of the room [%], one number per test.
         peak: force from which the branch of each point starts [mN], on virgin loading its own force, where a measured
-            record shows it better than its largest reading does (`mcc_jax.campaign.turning_forces`); None for the
-            largest force so far.
+            record shows it better than its largest reading (`mcc_jax.campaign.turning_forces`); None: largest so far.
     """
 
     force: Values
