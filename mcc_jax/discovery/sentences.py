@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 NOTHING_MISSING = "nothing missing"
 FORM = "form"  # code of the finding that the tests follow another form of unloading than was asked for
-TAKEN = "It describes what unloading tells of the effective modulus, too: what is left of that is of no solid."
+TAKEN = "It also explains the unloading, which tells the effective modulus: the value that is left is of no solid."
 JUMPS, CHECKS = 5, 3  # sudden steps and checks that a summary lists
 
 
