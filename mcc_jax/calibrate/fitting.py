@@ -142,8 +142,8 @@ class _Fitter:
         model, N = self.model, len(self.tests)
         noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
         self.noise = NoiseFit(noise, converged=True)
-        base = _Fitter(self.tests, replace(model, effects=(), varying=()), self.progress)
-        base.noise, theta = self.noise, np.zeros(0)
+        base, theta = _Fitter(self.tests, replace(model, effects=(), varying=()), self.progress), np.zeros(0)
+        base.noise = self.noise
         self.individual = base.alone()
         if model.effects:
             law = self.individual.point
@@ -224,7 +224,7 @@ class _Fitter:
         return self.blocks.share(fit_particles, of_particles, *shared)
 
     def alone(self, point: Point | None = None) -> ParticleFits:
-        """Every particle on its own, from this point on, the effects' numbers held; from nothing without effects."""
+        """Every particle on its own, from a point on, the effects' numbers held; from nothing without a point."""
         middle, N = _centre(self.model.chosen_priors), len(self.tests)
         theta = np.zeros((N, 0)) if point is None else np.asarray(point.theta)
         varying, zero_sd = theta[:, self.varying], self.model.chosen_priors.zero_um.sd

@@ -50,7 +50,7 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
     """Cut a test into segments that follow each other without gap or overlap.
 
     A reload that goes beyond the greatest force reached before is cut there: what follows is virgin "load". Where the
-    force stays at its lowest level while the platen moves away, that is still "unload". Turning points start a segment.
+    force stays at its lowest level while the platen moves away, that is "unload", too. A turning point begins the next.
 
     By default the controlled quantity is judged from the data: displacement where it stands still while the force
     relaxes, else force. A curve without a point, or with one that is not finite, raises `InputError`.

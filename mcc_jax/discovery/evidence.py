@@ -138,7 +138,7 @@ class Amplitudes(NamedTuple):
 
 
 def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Amplitudes:
-    """Integrate amplitudes out, each with an equal mixture of half-normal priors (normal for either sign).
+    """Integrate amplitudes out under an equal mixture of half-normal priors (normal if both signs are physical).
 
     Their scales are spread evenly in the logarithm from 1 to `largest`. Where several are cut, the corner's probability
     is taken for the product of the single ones.

@@ -32,7 +32,8 @@ class AbstractEffect(eqx.Module):
 
     Attributes:
         closed: whether all it does is a formula of particle and peak, without time, cycles or humidity: `modify` of the
-            particle alone, or an `AbstractModulusAtPeak`. Energy, particle codes and exports take only those classes.
+            particle alone, or an `AbstractModulusAtPeak`. Energy, particle codes and exports take those only. Set it on
+            the class.
         formulas: where the hooks of several formulas differ in one expression, these by name: functions of the effect
             and of what its hook gives them. Set it on the class.
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
