@@ -234,13 +234,17 @@ class Contact(Quintic):
     def recovered(self, peak: Values, secant: Values | None = None) -> Recovered:
         """What full release from a peak displacement gives back.
 
-        The secant is that of a peak which effects moved off the curve; the limit stays that of the curve.
+        The secant is that of a peak which effects moved off the curve. One above the curve stores no more energy than
+        one on it would: what effects add to the force of loading is lost.
         """
         square = self.formula_squared(peak, secant)
         tiny = jnp.finfo(peak.dtype).tiny  # down to where the root still has a derivative
         carries = (self.loading(peak) > tiny) & (square > tiny)
         formula = recompute(jnp.sqrt(jnp.where(carries, square, 1.0)))
         top, bottom, steep = self.limit(peak)
+        if secant is not None:
+            on_curve = self.secant(peak)
+            top = top * jnp.where(secant > on_curve, on_curve / jnp.where(carries, secant, 1.0), 1.0)
         limited = carries & (formula * bottom > top)
         top, bottom = jnp.where(limited, top, formula), jnp.where(limited, bottom, 1.0)
         return Recovered(jnp.where(carries, top, 1.0), bottom, carries, limited, steep)

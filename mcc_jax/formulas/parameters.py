@@ -229,7 +229,7 @@ class Formulas(eqx.Module):
     ) -> Values:
         """Displacement [um] recovered on full release from a peak, with a factor on the effective modulus.
 
-        Effects may have moved the peak off the loading curve; the limit of recovery stays that of the curve.
+        Effects may have moved the peak off the loading curve; the energy that it stores stays within the curve's limit.
         """
         moved = peak > jnp.finfo(peak.dtype).tiny ** 0.5
         contact = self.contact(particle)

@@ -168,6 +168,14 @@ def test_it_is_refused_where_a_particle_code_refuses_it():
     np.testing.assert_array_equal(passive, ours)
 
 
+@pytest.mark.parametrize("name", ["platen_friction:sticking", "rate_dependence:yield_cowper_symonds"])
+def test_what_lifts_the_loading_curve_is_not_given_back(name):
+    """Random paths of force at rates that jump by orders of magnitude: these gained up to half of the work put in."""
+    law, particle = energy_paths.draw(0, 2000, Unloading.PRINTED, StrainScaling.RAW)
+    taken, given_back = energy_paths.with_effect(find_variant(name), law, particle, 0, 2000)
+    assert np.all(given_back < taken)
+
+
 def test_other_effects_do_not_hide_it():
     others = ("frame_compliance", "creep", "size_effect", "humidity")
     path, time = jnp.linspace(0.0, load_at_the_end(), 40), jnp.arange(40.0)
