@@ -97,8 +97,7 @@ def discover(
         return _finished(found, (*wrong, *findings), started)
     fitted = partial(base_fit, model=without_effects(assumed), threshold_MPa=threshold_MPa, progress=progress)
     begun = partial(_begun, fitted=fitted, known=known, progress=progress)
-    search = begun(campaign, findings)
-    _run(search, seed)
+    search = _run(begun(campaign, findings), seed)
     if search.is_gap:
         search = _not_tared(campaign, search, begun, seed) or _other_form(search, assumed, seed) or search
     base, findings = search.base, (*findings, *search.left_out)
@@ -188,12 +187,13 @@ def _settled_fit(campaign: Campaign, findings: Sequence[Finding], fitted: Fit) -
     return base, left_out
 
 
-def _run(search: Search, seed: int) -> None:
-    """Work all hypotheses out; how likely so much evidence of anything is by chance."""
+def _run(search: Search, seed: int) -> Search:
+    """The search with all hypotheses worked out, and how likely so much evidence of anything is by chance."""
     with numbers_in_reach(search.base.campaign):
-        search.run()
+        search = search.run()
         search.progress("is anything missing")
         search.p_any = p_anything(search, seed)
+    return search
 
 
 def _not_tared(campaign: Campaign, search: Search, begun: Callable[..., Search], seed: int) -> Search | None:
@@ -210,7 +210,7 @@ def _not_tared(campaign: Campaign, search: Search, begun: Callable[..., Search],
     readings, as_read = (int(one.base.tests.mask.sum()) for one in (other, search))
     if other.null.log_evidence / readings <= best / as_read:
         return None
-    _run(other, seed)
+    other = _run(other, seed)
     if other.is_gap:
         return None
     text = (
@@ -238,10 +238,11 @@ def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
             return None
         search.progress("the same in the law's other form of unloading")
         base = replace(base, state=alone.state, hyperparameters=alone.optimum.hyper)
-        other = Search(base, search.library, search.whole, search.progress)
+        noise = None if search.noise is None else alone.optimum.hyper
+        other = Search(base, search.library, search.whole, search.progress, noise)
         if not other.comes_near(search.leader, max(one.alone for one in search.found.values())):
             return None
-    _run(other, seed)
+    other = _run(other, seed)
     best, other_best = (max(one.log_posteriors().values()) for one in (search, other))
     if other_best < best + STRONG:
         return None

@@ -139,12 +139,19 @@ def at_priors(base: Base, rows: np.ndarray) -> State:
     return State(replace(point, latent=latent, zero=zero), jnp.asarray(population))
 
 
-def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
-    """The base law at its mode under the kind of noise that the tests prefer: the model's own unless clearly not. Under
-    other noise formulas would be fitted to what the noise leaves."""
-    design = design_of(base, base.state)
-    own = optimise(design, base.hyperparameters, curvature=False)
-    others = [(*_with_own_scales(design, own.hyper, model), model) for model in noise_models(base)]
+def with_likely_noise(base: Base, r: Fitted | None = None) -> tuple[Base, Optimum]:
+    """The base law and a mode under the kind of noise that the tests prefer: the model's own unless clearly not. Under
+    other noise formulas would be fitted to what the noise leaves.
+
+    What noise leaves is judged by the law alone or, where much is missing, by a hypothesis `r`: otherwise particles in
+    which more is missing would count as noisier ones.
+    """
+    if r is None:
+        design = design_of(base, base.state)
+        own, models = optimise(design, base.hyperparameters, curvature=False), noise_models(base)
+    else:
+        design, own, models = r.design, r.optimum, (base.model, *noise_models(base))
+    others = [(*_with_own_scales(design, own.hyper, model), model) for model in models]
     best, scale, model = max(others, key=lambda one: one[0].log_joint)
     if best.log_joint > own.log_joint + STRONG:
         return replace(base, model=model, scale=scale), best

@@ -32,14 +32,20 @@ SECONDS = 3  # second names tried next to each of the two leading ones, and pair
 class Search:
     """One search: what all hypotheses share, and what was found."""
 
-    def __init__(self, base: Base, library: Library, whole: Library, progress: Progress) -> None:
-        """Fit the law alone; `library` has what is searched for, `whole` also formulas that the tests cannot show."""
-        base, start = with_likely_noise(base)
+    def __init__(
+        self, base: Base, library: Library, whole: Library, progress: Progress, noise: np.ndarray | None = None
+    ) -> None:
+        """Fit the law alone; `library` has what is searched for, `whole` also formulas that the tests cannot show, and
+        `noise` the hyperparameters under the kind of noise of the base law, where that is settled."""
+        start, self.noise = noise, noise
+        if start is None:
+            base, optimum = with_likely_noise(base)
+            start = optimum.hyper
         self.base, self.library, self.whole, self.progress = base, library, whole, progress
         places = [base.state]
         if base.coarse:
             places += [at_priors(base, rows) for rows in (base.snaps, np.ones(len(base.tests), bool)) if rows.any()]
-        fits = [fit_hypothesis(base, at, (), (), start.hyper) for at in places]
+        fits = [fit_hypothesis(base, at, (), (), start) for at in places]
         self.null = max(fits, key=lambda r: r.log_evidence)
         # Hypotheses look for their optimum from the null's state; of a material that the law was not made for from the
         # priors' middle, too, since such tests have several optima.
@@ -105,16 +111,16 @@ class Search:
                 both = one.with_discrepancy + min(one.other_noise, 0.0) - np.log(2 * count)
                 larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
                 logs[larger] = float(np.logaddexp(logs[larger], both - DECISIONS.pair - DECISIONS.unlisted))
-        return {names: v for names, v in logs.items() if len(names) < 2 or self._credible(names)}
+        return {n: v for n, v in logs.items() if len(n) < 2 or self._credible(n, self.found[n].at)}
 
-    def _credible(self, names: Names) -> bool:
-        """Whether the lesser name of a pair has a plausible amplitude; a larger one imitates what the other misses."""
-        r = self.found[names].at
+    def _credible(self, names: Names, r: Fitted | None) -> bool:
+        """Whether the lesser name of a pair has an amplitude within 95 % of its widest prior, whose scale is the largest
+        plausible one; a larger one imitates what the other misses."""
         if r is None:
             return True
         second = min(names, key=lambda n: self.found[(n,)].log_evidence)
         sizes = zip(r.variants, r.theta, strict=False)
-        return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
+        return all(abs(size) <= 1.96 * v.plausible[1] for v, size in sizes if v.mechanism == second)
 
     @cached_property
     def first_order(self) -> dict[str, dict[str, tuple[float, int]]]:
@@ -273,10 +279,11 @@ class Search:
                 if c.mechanism == each[other].mechanism and c.variant.name not in tried and len(tried) < ALL_FORMULAS:
                     tried.add(c.variant.name)
                     wanted.append((k, j))
-        every = [pair.fitted, *side_by_side(self.fit, wanted)]
+        first, every = pair.fitted, [pair.fitted, *side_by_side(self.fit, wanted)]
+        every = [r for r in every if self._credible(pair.names, r)] or every
         pair.at = max(every, key=lambda r: r.log_evidence)
         pair.alone = float(np.logaddexp.reduce([r.log_evidence for r in every])) - self.log_combinations(pair.names)
-        if pair.at is not every[0]:
+        if pair.at is not first:
             self.fit_misfit(pair)
 
     def log_combinations(self, names: Names) -> float:
@@ -292,21 +299,50 @@ class Search:
         if names not in self.found or value > self.found[names].alone:
             self.found[names] = Hypothesis(names, value, at=None if own is None else own.at, own=own)
 
-    def run(self) -> Search:
-        """Work all hypotheses out."""
-        nothing, order = self.null.log_evidence, self.first_order
-        rank = {m: float(logsumexp([v for v, _ in f.values()]) - np.log(len(f))) for m, f in order.items()}
-        names = sorted(rank, key=lambda m: -rank[m])
-        lead = rank[names[0]] - nothing if names else -np.inf
+    @cached_property
+    def rank(self) -> dict[str, float]:
+        """Log evidence of every mechanism to first order, best first."""
+        logs = {m: float(logsumexp([v for v, _ in f.values()]) - np.log(len(f))) for m, f in self.first_order.items()}
+        return dict(sorted(logs.items(), key=lambda item: -item[1]))
+
+    def fit_serious(self) -> None:
+        """The mechanisms that lead to first order, by their formulas."""
         self.progress("the serious names, fitted as they are")
-        serious = names[:CONTENDERS]
-        self.fit_singles(serious, FORMULAS if lead > VERY_STRONG else 1)
+        lead = max(self.rank.values(), default=-np.inf) - self.null.log_evidence
+        self.fit_singles(list(self.rank)[:CONTENDERS], FORMULAS if lead > VERY_STRONG else 1)
         if lead > STRONG:
             best = sorted(self.found.values(), key=lambda x: -x.log_evidence)[:2]
             self.fit_singles([one.names[0] for one in best if one.names], ALL_FORMULAS)
+
+    def run(self) -> Search:
+        """The search with all hypotheses worked out: this one or, where much is missing, one under the noise that the
+        leading name leaves, if that is clearly another. What is missing makes some particles look noisier than others.
+        """
+        search = self._settled()
+        search._run_others()
+        return search
+
+    def _settled(self) -> Search:
+        """This search or one under other noise, with the serious names in it."""
+        self.fit_serious()
+        leader = max(self.found.values(), key=lambda x: x.log_evidence)
+        if leader.log_evidence < self.null.log_evidence + VERY_STRONG:
+            return self
+        base, optimum = with_likely_noise(self.base, leader.fitted)
+        if base is self.base:
+            return self
+        again = Search(base, self.library, self.whole, self.progress, optimum.hyper)
+        again.untestable, again.left_out = self.untestable, self.left_out
+        again.fit_serious()
+        return again
+
+    def _run_others(self) -> None:
+        """Work all other hypotheses out."""
+        nothing, names = self.null.log_evidence, list(self.rank)
+        serious = names[:CONTENDERS]
         side_by_side(self.fit_misfit, [self.found[(m,)] for m in serious])
         for m in names[CONTENDERS:]:
-            self.found[(m,)] = Hypothesis((m,), rank[m])
+            self.found[(m,)] = Hypothesis((m,), self.rank[m])
         self.progress("what differs from test to test, and a discrepancy on no list")
         tasks: list[Callable[[], Any]] = [partial(self.discrepancy.added_to, self.base, self.null)]
         smooth, *ones = side_by_side(call, tasks + [partial(self.of_their_own, m, self.null) for m in self.not_shared])
@@ -331,7 +367,6 @@ class Search:
                 self.other_formulas(pair)
         self.progress("other kinds of noise")
         self.other_noise()
-        return self
 
     def comes_near(self, leader: Names, log_evidence: float) -> bool:
         """Whether nothing, what leads to first order, or another search's leader begins near a log evidence, or may."""

@@ -237,12 +237,14 @@ class CyclicDamage(AbstractEffect):
         return 1 / at_least(1 + self.amplitude * context.cycles)
 
 
+# The largest plausible amplitude changes the modulus at a strain of 0.35 by a factor of 4, by whichever formula.
+
 DAMAGE = family(Damage, "damage",
     "Bonds break while the particle is squeezed: the further it went, the softer it unloads.",
     row("exponential", "E exp(-kappa eps_P)", "A share of the bonds breaks per unit of strain."),
     row("linear", "E (1 - kappa eps_P)", "Damage in proportion to strain."),
-    row("rational", "E / (1 + kappa eps_P)", "The compliance of cracks is added."),
-    row("square", "E exp(-2 kappa eps_P^2)", "Damage that sets in late."),
+    row("rational", "E / (1 + kappa eps_P)", "The compliance of cracks is added.", plausible=(0.05, 9.0)),
+    row("square", "E exp(-2 kappa eps_P^2)", "Damage that sets in late.", plausible=(0.05, 6.0)),
     row("stress", "E exp(-kappa sigma_P / 10 MPa)", "Damage driven by stress."),
     row("threshold", "E exp(-kappa (eps_P - eps_0)) above eps_0", "No damage until a strain is reached.",
         Nuisance("threshold_strain", (0.15, 0.3), (0.0, 0.6), "strain where damage begins")),
@@ -278,11 +280,12 @@ DENSIFICATION = family(Densification, "densification_stiffening",
     "Pores close while the particle is squeezed: the further it went, the stiffer it is.",
     row("exponential", "E exp(b eps_P)", "Porosity falls with strain; E = E_0 exp(-b p).",
         source="Spriggs (1961), J. Am. Ceram. Soc. 44, 628"),
-    row("linear", "E (1 + b eps_P)", "The modulus grows in proportion to strain."),
+    row("linear", "E (1 + b eps_P)", "The modulus grows in proportion to strain.", plausible=(0.05, 9.0)),
     row("cellular", "E (1 + b eps_P / 2)^2", "The square of a density that grows with strain.",
-        source="Gibson and Ashby (1982), Proc. R. Soc. A 382, 43"),
-    row("relative_density", "E (1 - eps_P / 2)^-b", "A power of relative density.", source="Gibson and Ashby (1982)"),
-    row("square", "E exp(2 b eps_P^2)", "Stiffening that sets in late."),
+        source="Gibson and Ashby (1982), Proc. R. Soc. A 382, 43", plausible=(0.05, 6.0)),
+    row("relative_density", "E (1 - eps_P / 2)^-b", "A power of relative density.", source="Gibson and Ashby (1982)",
+        plausible=(0.05, 8.0)),
+    row("square", "E exp(2 b eps_P^2)", "Stiffening that sets in late.", plausible=(0.05, 6.0)),
     row("stress", "E exp(b sigma_P / 10 MPa)", "Stiffening driven by stress.", source="Schmalbach et al. (2021)"),
     row("heckel", "E exp[b (1 - exp(-sigma_P / sigma_H))]",
         "Pores close as Heckel found for tablets, and the modulus follows.",
