@@ -114,8 +114,8 @@ class Search:
         return {n: v for n, v in logs.items() if len(n) < 2 or self._credible(n, self.found[n].at)}
 
     def _credible(self, names: Names, r: Fitted | None) -> bool:
-        """Whether the lesser name of a pair has an amplitude within 95 % of its widest prior, whose scale is the largest
-        plausible one; a larger one imitates what the other misses."""
+        """Whether the lesser name of a pair has an amplitude within 95 % of its widest prior, of the scale of the
+        largest plausible one; a larger one imitates what the other misses."""
         if r is None:
             return True
         second = min(names, key=lambda n: self.found[(n,)].log_evidence)
