@@ -56,6 +56,14 @@ def test_a_hidden_effect_leads_and_its_probability_says_so(named):
     assert named.found[("frame_compliance",)].at.theta[0] == pytest.approx(0.004, rel=0.1)
 
 
+def test_particles_in_which_more_is_missing_are_not_taken_for_noisier_ones():
+    search = search_in(cached("frame_compliance=0.06"), FEW)
+    assert np.ptp(search.base.scale) > 1
+    settled = search._settled()
+    np.testing.assert_array_equal(settled.base.scale, 1.0)
+    assert settled.found["frame_compliance",].at.theta[0] == pytest.approx(0.06, rel=0.05)
+
+
 def test_p_values_of_nothing_are_uniform(monkeypatch):
     """Scores drawn from the null law itself in place of the observed ones."""
     nothing, plain = search_of(cached(seed=1)), verify._Statistic
