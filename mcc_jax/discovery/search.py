@@ -114,13 +114,12 @@ class Search:
         return {n: v for n, v in logs.items() if len(n) < 2 or self._credible(n, self.found[n].at)}
 
     def _credible(self, names: Names, r: Fitted | None) -> bool:
-        """Whether the lesser name of a pair has an amplitude within 95 % of its widest prior, of the scale of the
-        largest plausible one; a larger one imitates what the other misses."""
+        """Whether the lesser name of a pair has a plausible amplitude; a larger one imitates what the other misses."""
         if r is None:
             return True
         second = min(names, key=lambda n: self.found[(n,)].log_evidence)
         sizes = zip(r.variants, r.theta, strict=False)
-        return all(abs(size) <= 1.96 * v.plausible[1] for v, size in sizes if v.mechanism == second)
+        return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
 
     @cached_property
     def first_order(self) -> dict[str, dict[str, tuple[float, int]]]:
