@@ -89,6 +89,14 @@ def _root(matrix: np.ndarray) -> np.ndarray:
         return np.full(matrix.shape, np.nan)
 
 
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solutions of linear systems; not a number where one counts as singular, as at a step beyond arithmetic."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.full((*np.broadcast_shapes(matrix.shape[:-2], right.shape[:-2]), *right.shape[-2:]), np.nan)
+
+
 class Marginalised(NamedTuple):
     """Quadratic forms of columns and data after their first numbers, standard normal, are integrated out."""
 
@@ -112,7 +120,7 @@ class Marginalised(NamedTuple):
         down = -np.swapaxes(self.weights, -1, -2)
         cross = down @ of_schur
         eye = np.eye(self.root.shape[-1])
-        half = np.linalg.solve(self.root, np.broadcast_to(eye, self.root.shape))
+        half = _solve(self.root, np.broadcast_to(eye, self.root.shape))
         inner = cross @ np.swapaxes(down, -1, -2) - 0.5 * np.swapaxes(half, -1, -2) @ half
         outer = np.broadcast_to(of_schur, (*inner.shape[:-2], *of_schur.shape[-2:]))
         return np.block([[inner, cross], [np.swapaxes(cross, -1, -2), outer]])
@@ -121,10 +129,10 @@ class Marginalised(NamedTuple):
 def marginalise(gram: np.ndarray, count: int) -> Marginalised:
     """Integrate the first numbers out, which are standard normal."""
     root = _root(gram[..., :count, :count] + np.eye(count))
-    half = np.linalg.solve(root, gram[..., :count, count:])
+    half = _solve(root, gram[..., :count, count:])
     schur = gram[..., count:, count:] - np.swapaxes(half, -1, -2) @ half
     log_integral = -np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), -1)
-    weights = np.swapaxes(np.linalg.solve(np.swapaxes(root, -1, -2), half), -1, -2)
+    weights = np.swapaxes(_solve(np.swapaxes(root, -1, -2), half), -1, -2)
     return Marginalised(schur, log_integral, root, weights)
 
 
@@ -147,7 +155,7 @@ def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Ampli
     axes = np.meshgrid(*[np.linspace(0, 1, SCALES)] * count, indexing="ij")
     scale = np.exp(np.stack([a.ravel() for a in axes], -1) * np.log(largest)) if count else np.ones((1, 0))
     root = _root(gram + np.eye(count) * scale[:, None, :] ** -2.0)
-    half = np.linalg.solve(root, np.broadcast_to(np.eye(count), root.shape))
+    half = _solve(root, np.broadcast_to(np.eye(count), root.shape))
     covariance = np.swapaxes(half, 1, 2) @ half
     mean, sd = covariance @ score, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     z = sign * mean / sd
