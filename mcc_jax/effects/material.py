@@ -237,7 +237,7 @@ class CyclicDamage(AbstractEffect):
         return 1 / at_least(1 + self.amplitude * context.cycles)
 
 
-# The largest plausible amplitude changes the modulus at a strain of 0.35 by a factor of 4, by whichever formula.
+# Largest plausible amplitudes that differ below change the modulus by the same factor at a strain of 0.35, about 4.
 
 DAMAGE = family(Damage, "damage",
     "Bonds break while the particle is squeezed: the further it went, the softer it unloads.",

@@ -234,8 +234,7 @@ class Contact(Quintic):
     def recovered(self, peak: Values, secant: Values | None = None) -> Recovered:
         """What full release from a peak displacement gives back.
 
-        The secant is that of a peak which effects moved off the curve. One above the curve stores no more energy than
-        one on it would: what effects add to the force of loading is lost.
+        The secant is that of a peak which effects moved off the curve: above it no more energy is stored than on it.
         """
         square = self.formula_squared(peak, secant)
         tiny = jnp.finfo(peak.dtype).tiny  # down to where the root still has a derivative
