@@ -191,6 +191,33 @@ def how_to_read():
         return _png(figure)
 
 
+def tension():
+    """Force over displacement where a particle that sticks is pulled off, by several formulas."""
+    import numpy as np
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    import mcc_jax as mcc
+
+    law, particle = mcc.paper_law(), mcc.Particle(*DIAMETERS_UM)
+    drawn = {"law alone": None, "jkr": 0.3, "kendall": 3.0, "bond": 0.3, "mobilised": 0.3}
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 3.0), layout="constrained")
+        ax = figure.subplots()
+        for name, strength in drawn.items():
+            sticks = () if strength is None else (mcc.LIBRARY["adhesion"][name].build(strength),)
+            path = np.concatenate([np.linspace(0.0, 15.0, 60), np.linspace(15.0, 11.1, 700)])
+            test = mcc.drive(
+                law.with_effects(*sticks), particle, path, time=np.arange(float(len(path))) if sticks else None
+            )
+            color = VERMILION if strength is None else None
+            ax.plot(path[60:], test.force[60:], lw=2.8 if strength is None else 1.3, color=color, label=plain(name))
+        ax.axhline(0, color=GREY, lw=0.6)
+        ax.set(xlabel="displacement / µm", ylabel="force / mN", ylim=(-0.4, 0.8), xlim=(11.2, 11.8))
+        ax.legend(frameon=False, fontsize=8, loc="upper left")
+        return _png(figure)
+
+
 def _signed(value):
     return f"{value:+.2g}".replace("-", "\N{MINUS SIGN}")
 
@@ -467,7 +494,8 @@ def files():
             f"{FOLDER}/{name}-added.png": added,
             f"{FOLDER}/{name}-small.png": small,
         }
-    return found | {f"{FOLDER}/how-to-read.png": how_to_read(), "images/which-test.png": which_test_picture()}
+    found |= {f"{FOLDER}/how-to-read.png": how_to_read(), f"{FOLDER}/tension.png": tension()}
+    return found | {"images/which-test.png": which_test_picture()}
 
 
 BLOCKS = {"gallery": gallery, "sheet": sheet, "which-test": which_test, "look-alikes": look_alikes}

@@ -22,6 +22,8 @@ from .paper import PAPER_LOG_C as PAPER_LOG_C
 from .paper import PAPER_SHAPE_PARAMETER as PAPER_SHAPE_PARAMETER
 from .plausibility import check_plausibility as check_plausibility
 from .plausibility import other_material as other_material
+from .pull_off import PullOff as PullOff
+from .pull_off import pull_off as pull_off
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
 from .readers import read_diameters as read_diameters

@@ -11,9 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from .adjustment import effective_diameter_um
 from .findings import Finding, joined
 from .force_zero import NOT_TARED, shared_zero, zero_of_force
 from .plausibility import wrong_signs
+from .pull_off import pulled_off
 from .saturation import censor_displacement, censor_force
 from .schema import Campaign, Checked, Control, Curve, check_campaign
 from .segments import find_segments
@@ -90,10 +92,13 @@ def check_tests(campaign: Campaign, *, zero_mN: tuple[float, float] | None = Non
 
 
 def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
-    """What `check_tests` found in a campaign, one finding for all tests with the same fault."""
+    """What `check_tests` found in a campaign and which particles stuck to the platens, one finding for all alike."""
     check_campaign(campaign)
-    checked = zip(campaign.particles, (curve.checked for curve in campaign.curves), strict=True)
-    return joined({name: () if one is None else one.findings for name, one in checked})
+    each = {}
+    for name, sizes, curve in zip(campaign.particles, campaign.diameters_um, campaign.curves, strict=True):
+        faults = () if curve.checked is None else curve.checked.findings
+        each[name] = (*faults, *pulled_off(curve, effective_diameter_um(sizes)))
+    return joined(each)
 
 
 def _check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None, tests: int) -> Curve:

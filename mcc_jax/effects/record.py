@@ -207,6 +207,11 @@ class Context(eqx.Module):
         return jnp.where(loaded & (share < 1), share, 1.0)
 
     @property
+    def pulled_share(self) -> Values:
+        """The same, and below 0 in tension."""
+        return jnp.where(self.record.force < 0, self._over_peak(self.record.force)[1], self.load_share)
+
+    @property
     def recovered_share(self) -> Values:
         """s [-]: recovered over recoverable displacement of the law, 0 at the peak, 1 on full release."""
         return recovery(self.load_share)

@@ -84,8 +84,9 @@ class Adhesion(AbstractEffect):
     :math:`\kappa = 2 c^2 \epsilon_P s_{ad} / \sigma_P`, the stress over the contact's area at the peak, or
     :math:`\kappa = s_{ad} / \sigma_P` if it is counted `over_section` as all stresses of the law are, or
     :math:`\kappa = 2 \sqrt{\pi} a_P^{3/2} K_c / (\pi R_e^2 \sigma_P)` for a toughness of the contact's `edge`. Of its
-    solutions the largest is stable. Derivatives follow from the implicit-function rule. A formula is g, attraction
-    over its strength at the recovered share s.
+    solutions the largest is stable; there is none below the pull-off force, the least :math:`u' - \kappa g`, and there
+    the displacement stays where the contact broke. Derivatives follow from the implicit-function rule; those of the
+    place where it broke are left out. A formula is g, attraction over its strength at the recovered share s.
     """
 
     over_section: float = 0.0
@@ -101,7 +102,7 @@ class Adhesion(AbstractEffect):
     }
 
     def inside(self, context: Context) -> Values:
-        share = context.load_share
+        share = context.pulled_share
         carries = context.peak_stress > 1e-6
         radius = context.peak_contact_radius
         crack = 2 * jnp.sqrt(jnp.pi) * radius * root(radius) / context.particle.effective_area
@@ -114,19 +115,25 @@ class Adhesion(AbstractEffect):
         def excess(value: Values, share: Values, strength: Values) -> Values:
             return value - share - strength * self.of(recovery(value))
 
+        def with_slope(value: Values) -> tuple[Values, Values]:
+            return jax.jvp(lambda v: excess(v, frozen, fixed), (value,), (jnp.ones_like(value),))
+
         def halve(_: Any, bracket: tuple[Values, Values]) -> tuple[Values, Values]:
             low, high = bracket
             middle = 0.5 * (low + high)
-            below = excess(middle, frozen, fixed) <= 0
+            over, slope = with_slope(middle)
+            below = (over <= 0) | (slope < 0)  # of the largest solution, or of the place where the contact breaks
             return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
-        high = jnp.where(frozen + positive(fixed) < 1, frozen + positive(fixed), 1.0)
-        low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, (frozen, high))
-        slope = jax.jvp(lambda v: excess(v, frozen, fixed), (low,), (jnp.ones_like(low),))[1]
+        least = positive(frozen)
+        high = jnp.where(least + positive(fixed) < 1, least + positive(fixed), 1.0)
+        low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, (least, high))
+        over, slope = with_slope(low)
         slope = jnp.where(slope > 0.05, slope, 0.05)
-        value = low - excess(low, share, strength) / slope
+        holds = (frozen >= 0) | (over <= 1e-12)
+        value = low - jnp.where(holds, excess(low, share, strength), 0.0) / slope
         value = jnp.where(value < 1, value, 1.0)
-        return context.recoverable * (recovery(share) - recovery(value))
+        return context.recoverable * (context.recovered_share - recovery(value))
 
 
 _SECTION = "phi = a/a_P, u' = u + s_ad / sigma_P g, d = Delta [s(u) - s(u')]"

@@ -26,6 +26,7 @@ from ..geometry import Particle
 Effects = tuple[AbstractEffect, ...]
 AtPeak = tuple[AbstractModulusAtPeak, ...]
 HALVINGS = 64  # from the width of the bracket to below the rounding of a double
+MOST_TENSION = 1.0  # over the largest force so far, at which a contact that sticks breaks at the latest
 NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effects/test_physics.py
 
 
@@ -152,7 +153,8 @@ def additions(effects: Effects, memory: Memory, context: Context) -> tuple[tuple
 
 
 def force_at(displacement_under: Callable[..., Scalar], given: Any, displacement: Scalar, scale: Scalar) -> Scalar:
-    """Force [mN] at which a displacement [um] that grows with force is met; 0 where the platen does not touch.
+    """Force [mN] at which a displacement [um] that grows with force is met, below zero where the particle sticks to the
+    platen; 0 where the two do not touch.
 
     Bisection in a bracket that grows from a force of the right size; derivatives by the implicit-function rule.
     """
@@ -161,24 +163,24 @@ def force_at(displacement_under: Callable[..., Scalar], given: Any, displacement
     def gap(force: Scalar, _: Any = None) -> Scalar:
         return displacement_under(still, force) - target
 
-    zero = jnp.zeros_like(scale)
-    below = gap(zero) < 0
+    high = jax.lax.stop_gradient(scale)
+    bracket = {"lower": -MOST_TENSION * high, "upper": high}
+    met_somewhere = gap(bracket["lower"]) < 0
     solver = optx.Bisection(rtol=float(4 * jnp.finfo(scale.dtype).eps), atol=0.0, expand_if_necessary=True)
-    bracket = {"lower": zero, "upper": jax.lax.stop_gradient(scale)}
 
     def sought(force: Scalar, _: Any) -> Scalar:
         met = gap(force)
         # Where no force is enough, the bracket would grow for ever once the displacement is not a number.
-        return jnp.where(below, jnp.where(jnp.isnan(met), 1.0, met), force - 0.5 * bracket["upper"])
+        return jnp.where(met_somewhere, jnp.where(jnp.isnan(met), 1.0, met), force - 0.5 * high)
 
     found = optx.root_find(sought, solver, scale, options=bracket, max_steps=HALVINGS, throw=False).value
-    root = jax.lax.stop_gradient(jnp.where(below, found, 0.0))
+    root = jax.lax.stop_gradient(jnp.where(met_somewhere, found, 0.0))
     slope = jax.jvp(gap, (root,), (jnp.ones_like(root),))[1]
-    touches = (root > 0) & (slope > 0)
+    touches = (root != 0) & (slope > 0)
     off = displacement_under(given, root) - displacement
     # One Newton step from the frozen root carries the derivatives; its own length is rounding, which is not wanted.
     change = -(off - jax.lax.stop_gradient(off)) / jnp.where(touches, slope, 1.0)
-    return root + jnp.where(touches, change, 0.0)
+    return jnp.where(touches | (root > 0), root + jnp.where(touches, change, 0.0), 0.0)
 
 
 def strain_under(effects: Effects, law: Formulas, particle: Particle, record: Record, stress: Path) -> Path:
