@@ -10,7 +10,7 @@ import numpy as np
 
 from .._format import described
 from .evidence import LinearModel
-from .periods import Periodogram
+from .periods import Periodogram, sinusoids
 from .search import Search
 from .settings import HYPERPARAMETERS, UNLISTED, WAVES
 
@@ -24,7 +24,7 @@ LETTERS = {  # coordinates of a formula: letter and meaning
     "travel": ("g", "displacement / D_e"),
     "load": ("u", "F / F_peak"),
     "clock": ("t", "time [s]"),
-    "force": ("F", "force [mN]"),
+    "force": ("F", "force [mN]"),  # k: the stiffness of the test there [mN/um]
     "drive": ("d", "displacement [um]"),  # in what repeats alone
 }
 
@@ -80,11 +80,12 @@ def terms_of(letter: str, x: np.ndarray, low: float, high: float) -> dict[str, n
     return found
 
 
-def _sinusoids(letter: str, x: np.ndarray, one: Periodogram, size: np.ndarray) -> dict[str, np.ndarray]:
-    """Sinusoids of the likeliest period, as they are printed, and their values: errors in micrometres."""
-    period, angle = _rounded(1 / one.best, 4), 2 * np.pi * one.best * x
-    waves = {"sin": np.sin(angle), "cos": np.cos(angle)}
-    return {f"um / D_e {name}(2 pi {letter}/{period:g})": wave / size[:, None] for name, wave in waves.items()}
+def _periodic(letter: str, one: Periodogram, size: np.ndarray) -> dict[str, np.ndarray]:
+    """Sinusoids of the likeliest period, as they are printed, and their values: errors of an instrument in its unit."""
+    unit = "mN / (k D_e)" if one.coordinate == "force" else "um / D_e"
+    values = np.moveaxis(sinusoids(np.array([one.best]), one.errors), -1, 0) / size[:, None]
+    period = _rounded(1 / one.best, 4)
+    return {f"{unit} {name}(2 pi {letter}/{period:g})": x for name, x in zip(("cos", "sin"), values, strict=True)}
 
 
 def _rounded(x: float, digits: int = 2) -> float:
@@ -100,8 +101,8 @@ def closure(search: Search, seed: int) -> Closure:
     moving = {n: x for n, x in natural.items() if span[n][1] > span[n][0]}
     every = {n: terms_of(LETTERS[n][0], x, *span[n]) for n, x in moving.items() if n != "drive"}
     periods = {one.coordinate: one for one in search.discrepancy.periods}
-    sinusoids = {n: _sinusoids(LETTERS[n][0], moving[n], one, size) for n, one in periods.items()}
-    every |= {n: every.get(n, {}) | of_one for n, of_one in sinusoids.items()}
+    periodic = {n: _periodic(LETTERS[n][0], one, size) for n, one in periods.items()}
+    every |= {n: every.get(n, {}) | of_one for n, of_one in periodic.items()}
     terms = [(name, text) for name, of_one in every.items() for text in of_one]
     values = np.stack([x * size[:, None] for of_one in every.values() for x in of_one.values()], -1)
     values = np.where(mask[..., None], values, 0.0)
@@ -120,10 +121,10 @@ def closure(search: Search, seed: int) -> Closure:
     meanings = dict.fromkeys(" = ".join(LETTERS[terms[k][0]]) for k in chosen)
     # Weights along the coordinate have the size that the smooth discrepancy was found to have, in units of strain.
     unit = float(np.sqrt(np.mean((curve / size[:, None])[mask] ** 2)))
-    if terms[chosen[0]][1] in sinusoids.get(name, {}):
+    if terms[chosen[0]][1] in periodic.get(name, {}):
         one = periods[name]
         x = np.linspace(*span[name], max(POINTS, int(PER_PERIOD * one.best * np.ptp(span[name]))))
-        basis, there = one.columns(natural[name]) * np.mean(size), one.columns(x)
+        basis, there = one.columns(one.errors) * np.mean(size), one.columns([(x, one.unit)])
     else:
         x, there = np.linspace(*span[name], POINTS), _cosines(np.linspace(0.0, 1.0, POINTS))
         basis = _cosines(search.at[name]) * size[:, None, None]

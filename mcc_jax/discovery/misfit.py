@@ -137,7 +137,7 @@ def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)
     stress = splines(at["strain"], SPLINES) * yielding * size**2
-    cell = [np.concatenate([splines(at[name], SPLINES), waves(at[name])], -1) for name in ("force", "peak_force")]
+    cell = [splines(at[name], SPLINES) for name in ("force", "peak_force")]
     parts = [part * (size / np.mean(size)) for part in reduced]
     of_forces = stress, by_force * cell[0] + by_peak * cell[1]  # each with a variance of 1
     parts += [part / max(float(np.sqrt(np.mean(np.sum(part[mask] ** 2, -1)))), 1e-300) for part in of_forces]

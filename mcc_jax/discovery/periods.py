@@ -1,4 +1,4 @@
-"""What repeats with travel or with time: its period, by a periodogram of what the law leaves.
+"""What repeats with travel, with force or with time: its period, by a periodogram of what the law leaves.
 
 Bretthorst (1988), Bayesian Spectrum Analysis and Parameter Estimation, Lecture Notes in Statistics 48. A cosine and a
 sine of unknown amplitudes and frequency are compared with the law alone, whose numbers are integrated out.
@@ -6,7 +6,7 @@ sine of unknown amplitudes and frequency are compared with the law alone, whose 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,10 @@ REFINED = 9  # finer ones around the best
 HARMONICS = 2  # of a repetition that is no sinusoid; amplitudes as 1 / order
 AT_ONCE = 32  # frequencies whose information is worked out together
 
+# Coordinates of every point, each with the displacement that an error of 1 there makes: of force there are two, the
+# reading's own and the one from which its branch starts.
+Errors = Sequence[tuple[np.ndarray, np.ndarray | float]]
+
 
 @dataclass(frozen=True)
 class Periodogram:
@@ -33,6 +37,8 @@ class Periodogram:
     power: np.ndarray  # log likelihood ratio of cosine and sine together
     information: np.ndarray  # on either amplitude [1/um^2]
     best: float  # the likeliest frequency
+    errors: Errors = ()  # what repeats, at the tests
+    unit: float = 1.0  # displacement that an error of 1 makes, root mean square over the tests [um]
 
     def log_ratios(self, sizes: np.ndarray, power: np.ndarray) -> np.ndarray:
         """Log evidence of each frequency in campaigns of some powers; sds of the amplitudes are one of `sizes` [um]."""
@@ -48,41 +54,60 @@ class Periodogram:
         """What having chosen the likeliest frequency costs in log evidence."""
         return float(self.log_ratio(sizes, self.power[None])[0] - np.max(self.log_ratios(sizes, self.power[None])))
 
-    def columns(self, x: np.ndarray) -> np.ndarray:
+    def columns(self, errors: Errors) -> np.ndarray:
         """Sinusoids of the likeliest period and its harmonics, with a variance of 1 together [um]."""
         order = np.arange(1, HARMONICS + 1)
-        angle = 2 * np.pi * self.best * order * x[..., None]
-        found = np.concatenate([np.cos(angle) / order, np.sin(angle) / order], -1)
-        return found / np.sqrt(np.sum(order**-2.0))
+        return sinusoids(self.best * order, errors) / np.tile(order, 2) / (self.unit * np.sqrt(np.sum(order**-2.0)))
+
+
+def sinusoids(frequency: np.ndarray, errors: Errors) -> np.ndarray:
+    """Cosines of some frequencies, then sines."""
+    total: np.ndarray | float = 0.0
+    for x, weight in errors:
+        angle = 2 * np.pi * frequency * x[..., None]
+        total = total + np.concatenate([np.cos(angle), np.sin(angle)], -1) * np.asarray(weight)[..., None]
+    return np.asarray(total)
+
+
+def _errors_along(natural: Mapping[str, np.ndarray], null: Fitted) -> dict[str, Errors]:
+    """What an instrument may get wrong: travel [um], force [mN], and either with time [s]."""
+    mask, linear = np.asarray(null.design.tests.mask), null.design.linear
+    by_force, by_peak = (np.where(mask, x, 0.0) for x in (linear.by_force, linear.by_peak))
+    found: dict[str, Errors] = {name: [(natural[name], 1.0)] for name in ("drive", "clock") if name in natural}
+    return found | {"force": [(natural["force"], by_force), (natural["peak_force"], by_peak)]}
 
 
 def periodograms(natural: Mapping[str, np.ndarray], null: Fitted) -> tuple[Periodogram, ...]:
-    """Those of the drive's travel [um] and of time [s], where tests say anything of them."""
+    """Those of travel, time and force, where tests say anything of them."""
     mask = np.asarray(null.design.tests.mask)
-    found = (_periodogram(name, natural[name], mask, null) for name in ("drive", "clock") if name in natural)
+    found = (_periodogram(name, errors, mask, null) for name, errors in _errors_along(natural, null).items())
     return tuple(one for one in found if one is not None)
 
 
-def _periodogram(name: str, x: np.ndarray, mask: np.ndarray, null: Fitted) -> Periodogram | None:
+def _periodogram(name: str, errors: Errors, mask: np.ndarray, null: Fitted) -> Periodogram | None:
+    x = errors[0][0]
+    unit = float(np.sqrt(np.mean(sum(np.broadcast_to(weight, x.shape)[mask] ** 2 for _, weight in errors))))
     span, step = np.ptp(x[mask]), np.abs(np.diff(x))[mask[:, 1:] & mask[:, :-1]]
     fastest = 1 / (READINGS * max(float(np.median(step)), 1e-300))
     apart = 1 / (OVERSAMPLED * max(span, 1e-300))  # frequencies from each other
     frequency = apart * np.arange(LEAST_PERIODS * OVERSAMPLED, MOST)
     frequency = frequency[frequency <= fastest]
-    if not len(frequency):
+    if not (len(frequency) and unit > 0):
         return None
-    power, information = _against_law(frequency, x, mask, null)
+    of_unit = [(x, weight / unit) for x, weight in errors]
+    power, information = _against_law(frequency, of_unit, mask, null)
     near = frequency[np.argmax(power)] + np.linspace(-1, 1, REFINED) * apart
-    best = near[np.argmax(_against_law(near, x, mask, null)[0])]
-    return Periodogram(name, frequency, power, information, float(best))
+    best = near[np.argmax(_against_law(near, of_unit, mask, null)[0])]
+    return Periodogram(name, frequency, power, information, float(best), errors, unit)
 
 
-def _against_law(frequency: np.ndarray, x: np.ndarray, mask: np.ndarray, null: Fitted) -> tuple[np.ndarray, np.ndarray]:
+def _against_law(
+    frequency: np.ndarray, errors: Errors, mask: np.ndarray, null: Fitted
+) -> tuple[np.ndarray, np.ndarray]:
     """Log likelihood ratio of cosine and sine of each frequency, and information on either amplitude."""
     power, information = [], []
     for some in np.array_split(frequency, -(-len(frequency) // AT_ONCE)):
-        angle = 2 * np.pi * some * x[..., None]
-        columns = np.where(mask[..., None], np.concatenate([np.cos(angle), np.sin(angle)], -1), 0.0)
+        columns = np.where(mask[..., None], sinusoids(some, errors), 0.0)
         shared = LinearModel(null.optimum.hyper, null.design.with_amplitudes(columns)).shared()
         both = np.arange(len(some))[:, None] + [0, len(some)]
         inner = shared.information[both[:, :, None], both[:, None, :]] + 1e-9 * np.eye(2)

@@ -180,7 +180,7 @@ class Search:
         """Functions of what no mechanism explains."""
         parts = general(self.at, self.base.tests, self.null.design.linear)
         periods, mask = periodograms(self.natural, self.null), np.asarray(self.base.tests.mask)
-        sinusoids = (np.where(mask[..., None], one.columns(self.natural[one.coordinate]), 0.0) for one in periods)
+        sinusoids = (np.where(mask[..., None], one.columns(one.errors), 0.0) for one in periods)
         return Discrepancy(parts, float(self.null.optimum.hyper[0]), periods, tuple(sinusoids))
 
     def fit_discrepancy(self, leader: Hypothesis, at_least: float) -> None:

@@ -1,4 +1,4 @@
-"""What repeats with time or with travel is found by its period."""
+"""What repeats with time, with travel or with force is found by its period."""
 
 import numpy as np
 import pytest
@@ -28,10 +28,25 @@ def search_of(whole):
 
 def test_the_period_of_a_disturbance_is_found():
     search = search_of(disturbed(0.1, 53.0))
-    drive, clock = periodograms(search.natural, search.null)
-    assert (drive.coordinate, clock.coordinate) == ("drive", "clock")
+    drive, clock, force = periodograms(search.natural, search.null)
+    assert (drive.coordinate, clock.coordinate, force.coordinate) == ("drive", "clock", "force")
     assert 1 / clock.best == pytest.approx(53.0, rel=0.003)
     assert clock.power.max() > drive.power.max() + 20
+    assert p_anything(search, 0) < 0.01
+
+
+def test_the_period_of_an_error_of_the_load_cell_is_found():
+    """Force reads too much by 1 % of itself times a sine with a period of a tenth of the largest force."""
+    top = max(float(curve.force_mN.max()) for curve in cached().curves)
+    period = 0.1 * top
+
+    def read(c):
+        return c.time_s, c.force_mN * (1 + 0.01 * np.sin(2 * np.pi * c.force_mN / period)), c.displacement_um
+
+    search = search_of(with_curves(cached(), read))
+    drive, clock, force = periodograms(search.natural, search.null)
+    assert 1 / force.best == pytest.approx(period, rel=0.02)
+    assert force.power.max() > max(drive.power.max(), clock.power.max()) + 20
     assert p_anything(search, 0) < 0.01
 
 
@@ -70,8 +85,8 @@ def test_an_unknown_frequency_costs_the_number_of_those_tried():
 def test_sinusoids_of_a_period_repeat_with_it_and_have_a_variance_of_one():
     one = Periodogram("clock", np.ones(1), np.ones(1), np.ones(1), 1 / 7.0)
     x = np.linspace(0, 70, 1001)
-    np.testing.assert_allclose(one.columns(x), one.columns(x + 7.0), atol=1e-9)
-    np.testing.assert_allclose(np.sum(one.columns(x) ** 2, -1), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(one.columns([(x, 1.0)]), one.columns([(x + 7.0, 1.0)]), atol=1e-9)
+    np.testing.assert_allclose(np.sum(one.columns([(x, 1.0)]) ** 2, -1), 1.0, rtol=1e-9)
 
 
 @pytest.mark.extended
