@@ -12,9 +12,10 @@ from .._format import described
 from .evidence import LinearModel
 from .periods import Periodogram, sinusoids
 from .search import Search
-from .settings import HYPERPARAMETERS, UNLISTED, WAVES
+from .settings import HYPERPARAMETERS, UNLISTED
 
 POINTS, PER_PERIOD = 60, 12  # of the curve, and of each period at least
+WAVES = 12  # periods of a formula over the range of its coordinate
 SHORTLIST = 24  # terms that are tried in pairs
 ONE_TERM = 0.9  # share of what two terms of a formula explain from which on one term will do
 
@@ -82,10 +83,10 @@ def terms_of(letter: str, x: np.ndarray, low: float, high: float) -> dict[str, n
 
 def _periodic(letter: str, one: Periodogram, size: np.ndarray) -> dict[str, np.ndarray]:
     """Sinusoids of the likeliest period, as they are printed, and their values: errors of an instrument in its unit."""
-    unit = "mN / (k D_e)" if one.coordinate == "force" else "um / D_e"
+    unit = {"force": "mN / (k D_e) ", "travel": ""}.get(one.coordinate, "um / D_e ")
     values = np.moveaxis(sinusoids(np.array([one.best]), one.errors), -1, 0) / size[:, None]
     period = _rounded(1 / one.best, 4)
-    return {f"{unit} {name}(2 pi {letter}/{period:g})": x for name, x in zip(("cos", "sin"), values, strict=True)}
+    return {f"{unit}{name}(2 pi {letter}/{period:g})": x for name, x in zip(("cos", "sin"), values, strict=True)}
 
 
 def _rounded(x: float, digits: int = 2) -> float:

@@ -14,7 +14,6 @@ from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, Point
 from ..calibrate.running import compiled_quickly
 from ..effects.record import RELOAD, UNLOAD
-from .settings import WAVES
 
 HATS, DEGREE = 8, 2  # hat functions of each coordinate of a misfit, and total degree of its smooth products
 SPLINES, FINE_SPLINES = 12, 24  # cosines of each coordinate of a discrepancy on no list, and of stress
@@ -109,12 +108,6 @@ def splines(x: np.ndarray, count: int) -> np.ndarray:
     return weight * np.cos(np.pi * k * x[..., None])
 
 
-def waves(x: np.ndarray, count: int = WAVES) -> np.ndarray:
-    """Sines and cosines of two periods and more over a coordinate between 0 and 1, with a variance of 1 together."""
-    angle = 2 * np.pi * np.arange(2, count) * x[..., None]
-    return np.concatenate([np.cos(angle), np.sin(angle)], -1) / np.sqrt(count - 2)
-
-
 def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np.ndarray, ...]:
     """Functions of a discrepancy that no mechanism explains, those of each of its parts.
 
@@ -132,7 +125,6 @@ def general(at: Mapping[str, np.ndarray], tests: Tests, linear: Linear) -> tuple
         *(splines(at[name], SPLINES) for name in ("strain", "travel", "load", *timed)),
         splines(at["load"], SPLINES) * at["reloading"][..., None],
         products.reshape(*products.shape[:-2], -1),
-        waves(at["travel"]),
     ]
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)

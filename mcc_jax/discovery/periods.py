@@ -1,4 +1,4 @@
-"""What repeats with travel, with force or with time: its period, by a periodogram of what the law leaves.
+"""What repeats with travel, force or time: its period, by a periodogram of what the law leaves.
 
 Bretthorst (1988), Bayesian Spectrum Analysis and Parameter Estimation, Lecture Notes in Statistics 48. A cosine and a
 sine of unknown amplitudes and frequency are compared with the law alone, whose numbers are integrated out.
@@ -70,15 +70,17 @@ def sinusoids(frequency: np.ndarray, errors: Errors) -> np.ndarray:
 
 
 def _errors_along(natural: Mapping[str, np.ndarray], null: Fitted) -> dict[str, Errors]:
-    """What an instrument may get wrong: travel [um], force [mN], and either with time [s]."""
-    mask, linear = np.asarray(null.design.tests.mask), null.design.linear
-    by_force, by_peak = (np.where(mask, x, 0.0) for x in (linear.by_force, linear.by_peak))
+    """What may repeat: errors of the instrument along its travel [um], its force [mN] and time [s]; and what particles
+    do along the travel over their diameter, in proportion to their size."""
+    tests, linear = null.design.tests, null.design.linear
+    by_force, by_peak = (np.where(tests.mask, x, 0.0) for x in (linear.by_force, linear.by_peak))
     found: dict[str, Errors] = {name: [(natural[name], 1.0)] for name in ("drive", "clock") if name in natural}
-    return found | {"force": [(natural["force"], by_force), (natural["peak_force"], by_peak)]}
+    found["force"] = [(natural["force"], by_force), (natural["peak_force"], by_peak)]
+    return found | {"travel": [(natural["travel"], np.asarray(tests.effective_diameter)[:, None])]}
 
 
 def periodograms(natural: Mapping[str, np.ndarray], null: Fitted) -> tuple[Periodogram, ...]:
-    """Those of travel, time and force, where tests say anything of them."""
+    """Those of travel, time, force and reduced travel, where tests say anything of them."""
     mask = np.asarray(null.design.tests.mask)
     found = (_periodogram(name, errors, mask, null) for name, errors in _errors_along(natural, null).items())
     return tuple(one for one in found if one is not None)

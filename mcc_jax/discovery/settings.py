@@ -58,7 +58,6 @@ LENGTH_FACTORS = 1.0, 0.3
 
 CONTENDERS = 5  # mechanisms fitted at their own optimum, and hypotheses that are compared on held-out particles
 EARLY = 4  # Gauss-Newton steps that first order from an amplitude of zero may mislead
-WAVES = 12  # periods that a discrepancy may have over the range of travel
 
 # Estimate over standard error that is found with 95 % probability at the level: 1.645 for the probability, 2.95 for
 # the best of as many mechanisms as there are.
