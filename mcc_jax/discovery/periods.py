@@ -71,16 +71,16 @@ def sinusoids(frequency: np.ndarray, errors: Errors) -> np.ndarray:
 
 def _errors_along(natural: Mapping[str, np.ndarray], null: Fitted) -> dict[str, Errors]:
     """What may repeat: errors of the instrument along its travel [um], its force [mN] and time [s]; and what particles
-    do along the travel over their diameter, in proportion to their size."""
+    do along their largest strain so far, in proportion to their size."""
     tests, linear = null.design.tests, null.design.linear
     by_force, by_peak = (np.where(tests.mask, x, 0.0) for x in (linear.by_force, linear.by_peak))
     found: dict[str, Errors] = {name: [(natural[name], 1.0)] for name in ("drive", "clock") if name in natural}
     found["force"] = [(natural["force"], by_force), (natural["peak_force"], by_peak)]
-    return found | {"travel": [(natural["travel"], np.asarray(tests.effective_diameter)[:, None])]}
+    return found | {"strain": [(natural["strain"], np.asarray(tests.effective_diameter)[:, None])]}
 
 
 def periodograms(natural: Mapping[str, np.ndarray], null: Fitted) -> tuple[Periodogram, ...]:
-    """Those of travel, time, force and reduced travel, where tests say anything of them."""
+    """Those of travel, time, force and strain, where tests say anything of them."""
     mask = np.asarray(null.design.tests.mask)
     found = (_periodogram(name, errors, mask, null) for name, errors in _errors_along(natural, null).items())
     return tuple(one for one in found if one is not None)
@@ -90,7 +90,7 @@ def _periodogram(name: str, errors: Errors, mask: np.ndarray, null: Fitted) -> P
     x = errors[0][0]
     unit = float(np.sqrt(np.mean(sum(np.broadcast_to(weight, x.shape)[mask] ** 2 for _, weight in errors))))
     span, step = np.ptp(x[mask]), np.abs(np.diff(x))[mask[:, 1:] & mask[:, :-1]]
-    fastest = 1 / (READINGS * max(float(np.median(step)), 1e-300))
+    fastest = 1 / (READINGS * max(float(np.median(step[step > 0])), 1e-300)) if np.any(step > 0) else 0.0
     apart = 1 / (OVERSAMPLED * max(span, 1e-300))  # frequencies from each other
     frequency = apart * np.arange(LEAST_PERIODS * OVERSAMPLED, MOST)
     frequency = frequency[frequency <= fastest]
