@@ -71,16 +71,17 @@ def sinusoids(frequency: np.ndarray, errors: Errors) -> np.ndarray:
 
 def _errors_along(natural: Mapping[str, np.ndarray], null: Fitted) -> dict[str, Errors]:
     """What may repeat: errors of the instrument along its travel [um], its force [mN] and time [s]; and what particles
-    do along their largest strain so far, in proportion to their size."""
+    do, in proportion to their size, along their travel over the diameter and their largest strain so far."""
     tests, linear = null.design.tests, null.design.linear
     by_force, by_peak = (np.where(tests.mask, x, 0.0) for x in (linear.by_force, linear.by_peak))
     found: dict[str, Errors] = {name: [(natural[name], 1.0)] for name in ("drive", "clock") if name in natural}
     found["force"] = [(natural["force"], by_force), (natural["peak_force"], by_peak)]
-    return found | {"strain": [(natural["strain"], np.asarray(tests.effective_diameter)[:, None])]}
+    size = np.asarray(tests.effective_diameter)[:, None]
+    return found | {name: [(natural[name], size)] for name in ("travel", "strain")}
 
 
 def periodograms(natural: Mapping[str, np.ndarray], null: Fitted) -> tuple[Periodogram, ...]:
-    """Those of travel, time, force and strain, where tests say anything of them."""
+    """Those of every coordinate along which something may repeat, where tests say anything of it."""
     mask = np.asarray(null.design.tests.mask)
     found = (_periodogram(name, errors, mask, null) for name, errors in _errors_along(natural, null).items())
     return tuple(one for one in found if one is not None)

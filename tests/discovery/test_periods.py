@@ -29,7 +29,7 @@ def search_of(whole):
 def test_the_period_of_a_disturbance_is_found():
     search = search_of(disturbed(0.1, 53.0))
     drive, clock, *others = periodograms(search.natural, search.null)
-    assert [one.coordinate for one in (drive, clock, *others)] == ["drive", "clock", "force", "strain"]
+    assert [one.coordinate for one in (drive, clock, *others)] == ["drive", "clock", "force", "travel", "strain"]
     assert 1 / clock.best == pytest.approx(53.0, rel=0.003)
     assert clock.power.max() > drive.power.max() + 20
     assert p_anything(search, 0) < 0.01
@@ -44,7 +44,7 @@ def test_the_period_of_an_error_of_the_load_cell_is_found():
         return c.time_s, c.force_mN * (1 + 0.01 * np.sin(2 * np.pi * c.force_mN / period)), c.displacement_um
 
     search = search_of(with_curves(cached(), read))
-    drive, clock, force, _ = periodograms(search.natural, search.null)
+    drive, clock, force, *_ = periodograms(search.natural, search.null)
     assert 1 / force.best == pytest.approx(period, rel=0.02)
     assert force.power.max() > max(drive.power.max(), clock.power.max()) + 20
     assert p_anything(search, 0) < 0.01
