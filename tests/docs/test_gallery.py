@@ -65,7 +65,7 @@ def test_every_mechanism_is_in_the_tables(docs):
 def test_an_entry_is_complete_and_shows_a_picture(docs, monkeypatch):
     gallery = docs("gallery")
     creep = LIBRARY["creep"]
-    strength, most, *pictures = gallery.picture(creep)
+    strength, most, *pictures = docs("effect_pictures").picture(creep)
     assert 1.0 < most < 20.0
     monkeypatch.setattr(gallery, "pictures", lambda: {"creep": (strength, most, *pictures)})
     entry = gallery.entry(creep)
