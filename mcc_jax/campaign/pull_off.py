@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..formulas import PUNCH_AREA
+from .adjustment import effective_diameter_um, stress_and_strain
 from .findings import Finding
 from .force_zero import AIR_READINGS, unusual
 from .schema import Curve
-from .segments import contact_index, find_segments
-from .signal import SMALLEST_STEP, point_noise
+from .segments import find_segments
+from .signal import SMALLEST_STEP, median, point_noise
 
 MILLIJOULE = 1e6  # mJ/m^2 in one mN/um
 PULLED_OFF = Finding(
@@ -54,8 +55,8 @@ class PullOff(NamedTuple):
         return 0.75 * self.work_by_jkr
 
 
-def pull_off(curve: Curve, effective_diameter_um: float) -> PullOff | None:
-    """The pull-off of a test; None where its record shows none.
+def pull_off(curve: Curve, diameters_um: Any) -> PullOff | None:
+    """The pull-off of a test on a particle with three diameters [um]; None where its record shows none.
 
     Force falls below what it is after the contact has broken, by more than noise and drift there explain. A record
     that ends in contact shows none.
@@ -66,20 +67,20 @@ def pull_off(curve: Curve, effective_diameter_um: float) -> PullOff | None:
     free = force[lowest + 1 :]
     if len(free) < AIR_READINGS:
         return None
-    zero = float(np.median(free))
+    zero = median(free)
     tension, largest = zero - float(force[lowest]), float(force[top]) - zero
     noise = max(point_noise(force), float(np.std(free)))
     if tension <= max(unusual(len(force) - top) * noise, SMALLEST_STEP * largest):
         return None
     released = top + int(np.argmax(force[top:] <= zero))  # where the branch goes through zero
     recovered = float(path[top] - path[released])
-    peak = float(path[top] - path[contact_index(find_segments(curve))])
-    if min(recovered, peak) <= 0:
+    _, strain = stress_and_strain(curve, np.asarray(diameters_um), find_segments(curve))
+    if recovered <= 0 or strain[top] <= 0:
         return None
-    return PullOff(tension, 2 * PUNCH_AREA * effective_diameter_um * peak / recovered)
+    return PullOff(tension, 2 * PUNCH_AREA * effective_diameter_um(diameters_um) ** 2 * float(strain[top]) / recovered)
 
 
-def pulled_off(curve: Curve, effective_diameter_um: float) -> tuple[Finding, ...]:
+def pulled_off(curve: Curve, diameters_um: np.ndarray) -> tuple[Finding, ...]:
     """What is said of a test that shows a pull-off."""
-    found = pull_off(curve, effective_diameter_um)
+    found = pull_off(curve, diameters_um)
     return () if found is None else (PULLED_OFF.of(found.force_mN, found.work_by_dmt, found.work_by_jkr),)

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from .adjustment import effective_diameter_um
 from .findings import Finding, joined
 from .force_zero import NOT_TARED, shared_zero, zero_of_force
 from .plausibility import wrong_signs
@@ -97,7 +96,7 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
     each = {}
     for name, sizes, curve in zip(campaign.particles, campaign.diameters_um, campaign.curves, strict=True):
         faults = () if curve.checked is None else curve.checked.findings
-        each[name] = (*faults, *pulled_off(curve, effective_diameter_um(sizes)))
+        each[name] = (*faults, *pulled_off(curve, sizes))
     return joined(each)
 
 

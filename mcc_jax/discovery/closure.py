@@ -25,8 +25,8 @@ LETTERS = {  # coordinates of a formula: letter and meaning
     "travel": ("g", "displacement / D_e"),
     "load": ("u", "F / F_peak"),
     "clock": ("t", "time [s]"),
-    "force": ("F", "force [mN]"),  # k: the stiffness of the test there [mN/um]
-    "drive": ("d", "displacement [um]"),  # in what repeats alone
+    "force": ("F", "force [mN]"),
+    "drive": ("d", "displacement [um]"),  # in what repeats alone; dF/dd is the test's stiffness
 }
 
 
@@ -83,7 +83,7 @@ def terms_of(letter: str, x: np.ndarray, low: float, high: float) -> dict[str, n
 
 def _periodic(letter: str, one: Periodogram, size: np.ndarray) -> dict[str, np.ndarray]:
     """Sinusoids of the likeliest period, as they are printed, and their values: errors of an instrument in its unit."""
-    unit = {"force": "mN / (k D_e) ", "strain": "", "travel": ""}.get(one.coordinate, "um / D_e ")
+    unit = {"force": "mN / (D_e dF/dd) ", "strain": "", "travel": ""}.get(one.coordinate, "um / D_e ")
     values = np.moveaxis(sinusoids(np.array([one.best]), one.errors), -1, 0) / size[:, None]
     period = _rounded(1 / one.best, 4)
     return {f"{unit}{name}(2 pi {letter}/{period:g})": x for name, x in zip(("cos", "sin"), values, strict=True)}

@@ -130,7 +130,7 @@ class Adhesion(AbstractEffect):
         low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, (least, high))
         over, slope = with_slope(low)
         slope = jnp.where(slope > 0.05, slope, 0.05)
-        holds = (frozen >= 0) | (over <= 1e-12)
+        holds = (frozen >= 0) | (over <= 0)
         value = low - jnp.where(holds, excess(low, share, strength), 0.0) / slope
         value = jnp.where(value < 1, value, 1.0)
         return context.recoverable * (context.recovered_share - recovery(value))

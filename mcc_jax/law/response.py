@@ -26,7 +26,6 @@ from ..geometry import Particle
 Effects = tuple[AbstractEffect, ...]
 AtPeak = tuple[AbstractModulusAtPeak, ...]
 HALVINGS = 64  # from the width of the bracket to below the rounding of a double
-MOST_TENSION = 1.0  # over the largest force so far, at which a contact that sticks breaks at the latest
 NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effects/test_physics.py
 
 
@@ -164,7 +163,7 @@ def force_at(displacement_under: Callable[..., Scalar], given: Any, displacement
         return displacement_under(still, force) - target
 
     high = jax.lax.stop_gradient(scale)
-    bracket = {"lower": -MOST_TENSION * high, "upper": high}
+    bracket = {"lower": -high, "upper": high}  # at a tension as large as that a contact has broken
     met_somewhere = gap(bracket["lower"]) < 0
     solver = optx.Bisection(rtol=float(4 * jnp.finfo(scale.dtype).eps), atol=0.0, expand_if_necessary=True)
 

@@ -17,7 +17,7 @@ CONTACT = LAW.contact(PARTICLE)
 PEAK_FORCE = float(CONTACT.loading(jnp.asarray(TOP)))
 SPAN = float(CONTACT.recovered(jnp.asarray(TOP)).displacement)
 RADIUS = float(contact_radius(PARTICLE, PARTICLE.strain(jnp.asarray(TOP))))
-DIAMETER = float(PARTICLE.effective_diameter)
+DIAMETERS = [float(D) for D in (PARTICLE.D1, PARTICLE.D2, PARTICLE.D3)]
 
 
 def toughness(work):
@@ -86,12 +86,12 @@ def curve_of(law, noise, seed=0):
 def test_the_work_of_adhesion_comes_out_of_a_record():
     work = 0.5
     law = LAW.with_effects(LIBRARY["adhesion"]["kendall"].build(toughness(work)))
-    found = pull_off(curve_of(law, 5e-4), DIAMETER)
+    found = pull_off(curve_of(law, 5e-4), DIAMETERS)
     assert found is not None
     assert found.radius_um == pytest.approx(4 * RADIUS**2 / SPAN, rel=0.1)
     assert found.work_by_jkr == pytest.approx(work, rel=0.15)
     assert found.work_by_dmt == pytest.approx(0.75 * found.work_by_jkr)
-    campaign = mcc.Campaign(["p"], [[float(D) for D in (PARTICLE.D1, PARTICLE.D2, PARTICLE.D3)]], [curve_of(law, 5e-4)])
+    campaign = mcc.Campaign(["p"], [DIAMETERS], [curve_of(law, 5e-4)])
     said = [one for one in campaign_findings(check_tests(campaign)) if one.check == "pull-off"]
     assert len(said) == 1
     assert said[0].level == "info"
@@ -100,7 +100,7 @@ def test_the_work_of_adhesion_comes_out_of_a_record():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_without_adhesion_no_pull_off_is_seen_in_noise(seed):
-    assert pull_off(curve_of(LAW, 0.05, seed), DIAMETER) is None
+    assert pull_off(curve_of(LAW, 0.05, seed), DIAMETERS) is None
 
 
 @pytest.mark.extended
