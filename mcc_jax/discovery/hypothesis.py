@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import betaln, expit, logsumexp
 
+from ..calibrate.noise import Along
 from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..effects import Variant
@@ -31,6 +32,7 @@ FOLLOWED = 4  # times at most that the prior of a misfit follows the amplitude o
 AGREE = 0.1  # difference of the logarithms of the two at which it need not
 DRIFTS = 6  # drifts of every test's own that are fitted at their own optimum
 MOST_STEPS = 12  # sudden ones of one test
+LENGTH = 3  # the place of the logarithm of the correlation's length among the hyperparameters
 
 
 @dataclass
@@ -260,44 +262,53 @@ class Step(NamedTuple):
     sd: float
 
 
-def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects | None:
+def sudden_steps(base: Base, start: Fitted, variant: Variant, *, of_noise: bool = False) -> RandomEffects | None:
     """Sudden steps in some tests, found one after the other, added to a fit; None without any. A test has one with a
-    probability that is itself unknown, uniformly, at any point of its loading."""
+    probability that is itself unknown, uniformly, at any point of its loading. Those of the noise are of either sign,
+    at any point, and fade with its correlation: innovational outliers in place of level shifts (Chen and Liu 1993, J.
+    Am. Stat. Assoc. 88, 284)."""
     mask = np.asarray(base.tests.mask)
-    loading = np.asarray(base.tests.loading) & mask
+    response = np.where(mask[..., None], np.tril(np.ones((mask.shape[1], mask.shape[1]))), 0.0)
+    allowed, sign = mask if of_noise else np.asarray(base.tests.loading) & mask, 0 if of_noise else 1
+    if of_noise:
+        place = np.asarray(base.tests.path if base.model.along is Along.LOAD else base.tests.record.time)
+        away = np.maximum(place[:, :, None] - place[:, None], 0.0) / np.exp(start.optimum.hyper[LENGTH])
+        response *= np.exp(-away)
     low, high = variant.plausible
     unit, now, best, value = high / 3, start, None, -np.inf
     columns, found, steps = (), list[Step](), list[Step]()
     for turn in range(MOST_STEPS):
-        score, information = step_scores(now)
+        score, information = step_scores(now, response)
         new, count = np.zeros((*mask.shape, 1)), len(found)
-        for i, of_loading in enumerate(loading):
-            rows = np.flatnonzero(of_loading)[1:]
+        for i, points in enumerate(allowed):
+            rows = np.flatnonzero(points)[1:]
             if not len(rows):
                 continue
-            each = single_integrals(low * score[i, rows], low**2 * information[i, rows], 1, high / low)
+            each = single_integrals(low * score[i, rows], low**2 * information[i, rows], sign, high / low)
             if logsumexp(each) - np.log(len(rows)) > np.log((1 - DECISIONS.jump) / DECISIONS.jump):
                 j = int(rows[int(np.argmax(each))])
-                new[i, j:, 0] = np.where(mask[i, j:], unit, 0.0)
+                new[i, :, 0] = unit * response[i, :, j]
                 found.append(Step(i, j, turn, float(max(information[i, j], 1e-300) ** -0.5)))
         if len(found) == count:
             break
         columns = (*columns, new)
-        more = ExtraColumns(columns, (SPREAD,) * (turn + 1))
-        design = design_of(base, start.state, start.variants, more)
-        optimum = optimise(design, np.concatenate([start.optimum.hyper, np.ones(turn + 1)]), curvature=False)
+        spreads = (SPREAD,) * (turn + 1)
+        own = np.concatenate([start.design.own, *columns], -1)
+        design = replace(start.design, own=own, spreads=(*start.design.spreads, *spreads))
+        hyper = np.insert(start.optimum.hyper, 4 + len(start.design.spreads), np.ones(turn + 1))
+        optimum = optimise(design, hyper, curvature=False)
         # Which tests have steps, how many, and where.
         with_steps = len({step.test for step in found})
         several = (len(found) - with_steps) * np.log(0.5)
-        places = sum(np.log(max(loading[step.test].sum(), 1)) for step in found)
-        log_prior = float(betaln(with_steps + 1, len(loading) - with_steps + 1) + several - places)
+        places = sum(np.log(max(allowed[step.test].sum(), 1)) for step in found)
+        log_prior = float(betaln(with_steps + 1, len(allowed) - with_steps + 1) + several - places)
         with_prior = optimum.log_joint + log_prior
         if with_prior <= value:
             break
         value, now = with_prior, replace(start, design=design, optimum=optimum)
-        best, steps = RandomEffects(variant, {}, value, now, more), list(found)
-    if best is None:
-        return None
+        best, steps = RandomEffects(variant, {}, value, now, ExtraColumns(columns, spreads)), list(found)
+    if best is None or of_noise:
+        return best
     at = fit_hypothesis(base, start.state, start.variants, start.theta, best.at.optimum.hyper, best.more)
     force, diameter, jumps = np.asarray(base.tests.force), np.asarray(base.tests.effective_diameter), []
     for step in steps:
@@ -306,14 +317,18 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects |
             stress = float(1e3 * force[i, step.point] / (np.pi * diameter[i] ** 2 / 4))
             probability = float(expit((size / step.sd) ** 2 / 2 - np.log(len(force[i]))))
             jumps.append(Jump(base.names[i], stress, size, step.sd, probability))
-    return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=tuple(jumps)) if jumps else None
+    return (
+        replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=tuple(jumps))
+        if jumps or of_noise
+        else None
+    )
 
 
-def step_scores(now: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Score and information of a step of 1 um at every point, each particle's own numbers integrated out."""
-    design, points = now.design, now.design.data.shape[1]
+def step_scores(now: Fitted, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Score and information of a step of 1 um at every point, each particle's own numbers integrated out; `response`
+    has what a step (last axis) moves at every point."""
+    design = now.design
     residual = design.data - design.common @ now.solution.common - design.amplitude @ now.solution.amplitude
-    steps = np.where(np.asarray(design.tests.mask)[..., None], np.tril(np.ones((points, points))), 0.0)
     alone = replace(design, data=residual, common=design.common[..., :0], group=design.group[:0])
-    particles = LinearModel(now.optimum.hyper, alone.with_amplitudes(steps)).particles
+    particles = LinearModel(now.optimum.hyper, alone.with_amplitudes(response)).particles
     return particles.score, np.diagonal(particles.information, axis1=1, axis2=2)

@@ -106,9 +106,9 @@ class Search:
         if UNLISTED in logs:
             logs[UNLISTED] = self.found[UNLISTED].log_evidence - DECISIONS.unlisted
         for names, one in self.found.items():
-            if len(names) == 1 and np.isfinite(one.with_discrepancy):
-                # Two causes, of which one is on no list: they count for the one that explains more by itself.
-                both = one.with_discrepancy + min(one.other_noise, 0.0) - np.log(2 * count)
+            if np.isfinite(one.with_discrepancy):
+                # A further cause, on no list: they count for the one that explains more by itself.
+                both = one.with_discrepancy + min(one.other_noise, 0.0) + priors[len(names)] - np.log(1 + len(names))
                 larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
                 logs[larger] = float(np.logaddexp(logs[larger], both - DECISIONS.pair - DECISIONS.unlisted))
         return {n: v for n, v in logs.items() if len(n) < 2 or self._credible(n, self.found[n].at)}
@@ -183,11 +183,11 @@ class Search:
         sinusoids = (np.where(mask[..., None], one.columns(one.errors), 0.0) for one in periods)
         return Discrepancy(parts, float(self.null.optimum.hyper[0]), periods, tuple(sinusoids))
 
-    def fit_discrepancy(self, leader: Hypothesis, at_least: float) -> None:
-        """Log evidence of a name with a smooth discrepancy in addition, where it comes near that of another."""
-        found = self.discrepancy.added_to(self.base, leader.fitted, at_least)
+    def fit_discrepancy(self, one: Hypothesis, at_least: float) -> None:
+        """Log evidence of names with a smooth discrepancy in addition, where it comes near that of another."""
+        found = self.discrepancy.added_to(self.base, one.fitted, at_least)
         if found is not None:
-            leader.with_discrepancy = found.log_evidence
+            one.with_discrepancy = found.log_evidence
 
     def of_their_own(self, name: str, start: Fitted) -> RandomEffects | None:
         """A mechanism whose numbers differ from test to test, in addition to what is there at the start."""
@@ -219,17 +219,22 @@ class Search:
             if gain < 0 or len(seconds) >= SECONDS:
                 break
             seconds.setdefault(pair_of(name, c.mechanism), k)
+        tasks: list[tuple[Names, Callable[[], RandomEffects | None]]] = []
         if own is None:
             first = self.row_of(at)[0]
             pairs = self.fit_pairs({names: (first, k) for names, k in seconds.items()})
-            further = {pair_of(m, name): partial(self.of_their_own, m, at) for m in self.not_shared}
+            tasks += [(pair_of(m, name), partial(self.of_their_own, m, at)) for m in self.not_shared]
         else:
-            pairs, start = [], (self.base, self.null.state)
-            further = {n: partial(own.next_to, *start, *self.start_of([k]), self.small) for n, k in seconds.items()}
-        for names, one in zip(further, side_by_side(call, list(further.values())), strict=True):
+            pairs = []
+            for names, k in seconds.items():
+                start = self.base, self.null.state, *self.start_of([k]), self.small
+                tasks.append((names, partial(own.next_to, *start)))
+                # Numbers that were found without the second name have taken up some of its effect.
+                tasks.append((names, partial(self.of_their_own, name, self.fit((k,)))))
+        for (names, _), one in zip(tasks, side_by_side(call, [task for _, task in tasks]), strict=True):
             self.keep(names, one)
             self.without_name(names, one)
-        self.fit_misfits([*pairs, *further], leader)
+        self.fit_misfits([*pairs, *(names for names, _ in tasks)], leader)
 
     def without_name(self, pair: Names, own: RandomEffects | None) -> None:
         """Numbers of every test's own that were found next to a name, without it: the search for them may end early."""
@@ -360,12 +365,34 @@ class Search:
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None:
                 self.pairs_with(first)
-            pairs = [x for x in self.found.values() if len(x.names) == 2 and x.at is not None and x.own is None]
-            pairs = [pair for pair in pairs if pair.log_evidence > first.log_evidence]
-            for pair in sorted(pairs, key=lambda x: -x.log_evidence)[:2]:
-                self.other_formulas(pair)
+            self.replace_names(first, {x.names for x in leading})
+            if max(x.with_discrepancy for x in leading) > max(x.log_evidence for x in self.found.values()):
+                for pair in self.pairs_better_than(first):  # where one name needs a discrepancy, two may need it, too
+                    self.fit_discrepancy(pair, most)
         self.progress("other kinds of noise")
         self.other_noise()
+
+    def replace_names(self, first: Hypothesis, seen: set[Names]) -> None:
+        """The two best pairs by all formulas, and the best second names next to each name of the best pair, until
+        none is new (sequential replacement: Miller, Subset selection in regression, 2002, chapter 3): the name that
+        leads alone may imitate two others together. `seen` are the names whose second ones are known."""
+        while new := [pair for pair in self.pairs_better_than(first) if pair.names not in seen]:
+            for pair in new:
+                self.other_formulas(pair)
+                seen.add(pair.names)
+            best = self.pairs_better_than(first)[:1]
+            for m in [m for pair in best for m in pair.names if (m,) not in seen]:
+                if self.found[m,].at is None:
+                    self.fit_singles([m], FORMULAS)
+                    self.fit_misfit(self.found[m,])
+                self.pairs_with(self.found[m,])
+                seen.add((m,))
+
+    def pairs_better_than(self, first: Hypothesis) -> list[Hypothesis]:
+        """The two best pairs of names whose numbers all tests share, if they explain more than one name does."""
+        pairs = [x for x in self.found.values() if len(x.names) == 2 and x.at is not None and x.own is None]
+        better = [pair for pair in pairs if pair.log_evidence > first.log_evidence]
+        return sorted(better, key=lambda x: -x.log_evidence)[:2]
 
     def comes_near(self, leader: Names, log_evidence: float) -> bool:
         """Whether nothing, what leads to first order, or another search's leader begins near a log evidence, or may."""
@@ -383,24 +410,38 @@ class Search:
         self.fit_misfits(self.fit_pairs(self.leading_pairs()), leaders[0])
 
     def other_noise(self) -> None:
-        """Average the leading hypotheses over kinds of noise, if another kind may explain the gap or a second name."""
+        """Average the leading hypotheses over kinds of noise, if another kind may explain the gap or a second name;
+        where something steps, the noise may have outliers that steps resemble."""
         logs = self.log_posteriors()
         leader = next(iter(logs))
         if not leader:
             return
         kinds = noise_models(self.base)
-        gains: dict[Names, list[float]] = {(): self._gains_by_noise(self.found[()], kinds)}
+        steps = any(m in self.library and self.library[m].sudden for m in leader)
+        gains: dict[Names, list[float]] = {}
+
+        def work_out(names: Names) -> None:
+            one = self.found[names]
+            if names not in gains and one.at is not None:
+                gains[names] = [*self._gains_by_noise(one, kinds), *([self._gain_by_outliers(one)] if steps else [])]
+
+        work_out(())
         wanted = list(logs)[:SECONDS]
         if len(leader) == 2:
             wanted += [names for names in logs if len(names) == 1][:SECONDS]
         elif logs[()] + max(gains[()]) < logs[leader] - STRONG:
             return
         for names in wanted:
-            if names not in gains and self.found[names].at is not None:
-                gains[names] = self._gains_by_noise(self.found[names], kinds)
+            work_out(names)
         for names, one in self.found.items():
             # What was not worked out counts as if no other kind explained it better.
-            one.other_noise = float(logsumexp([0.0, *gains.get(names, ())]) - np.log(1 + len(kinds)))
+            one.other_noise = float(logsumexp([0.0, *gains.get(names, ())]) - np.log(1 + len(gains[()])))
+
+    def _gain_by_outliers(self, one: Hypothesis) -> float:
+        """What a hypothesis gains where some readings' noise has outliers in addition, which fade."""
+        (sudden, *_) = (self.library[m].variants[0] for m in self.not_shared if self.library[m].sudden)
+        found = sudden_steps(self.base, one.fitted, sudden, of_noise=True)
+        return -np.inf if found is None else found.log_evidence - one.fitted.optimum.log_joint
 
     def _gains_by_noise(self, one: Hypothesis, models: Sequence[Model]) -> list[float]:
         """What a hypothesis in its likelier form gains under other kinds of noise; the best one is kept of a name."""

@@ -98,6 +98,8 @@ def _verdict(found: Discovery) -> str:
     chance = f"probability of so much evidence by chance: {found.p_any:.2g}"
     if found.verdict == "NO_GAP":
         agree = f"The law and the {count} tests agree within the noise"
+        if found.p_any < DECISIONS.level:
+            chance += "; noise of another kind, or with outliers, and nothing missing is more probable than any name"
         return f"{agree}; as far as they can show, nothing is missing ({chance})."
     place = ""
     if found.where:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigns import base_of, cached, with_curves
+from campaigns import N, base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
 from mcc_jax.discovery import answer, screen, verify
@@ -62,6 +62,23 @@ def test_particles_in_which_more_is_missing_are_not_taken_for_noisier_ones():
     settled = search._settled()
     np.testing.assert_array_equal(settled.base.scale, 1.0)
     assert settled.found["frame_compliance",].at.theta[0] == pytest.approx(0.06, rel=0.05)
+
+
+@pytest.mark.parametrize(("hidden", "leads"), [("", ()), ("pop_in=1.0,location_MPa=4", ("pop_in",))], ids=str)
+def test_outliers_of_the_noise_fade_and_are_of_either_sign_while_steps_stay(hidden, leads):
+    campaign = cached(*filter(None, [hidden]))
+
+    rng = np.random.default_rng(2)
+    outliers = [(rng.integers(10, 40), 1.0 - k % 2 * 2.0) for k in range(N)]
+
+    def with_outlier(curve):
+        place, size = outliers.pop()
+        after = np.arange(len(curve.time_s)) - place
+        fading = np.where(after >= 0, np.exp(-np.maximum(after, 0) / 10), 0.0)
+        return curve.time_s, curve.force_mN, curve.displacement_um + size * fading
+
+    search = search_in(with_curves(campaign, with_outlier), {name: LIBRARY[name] for name in ("pop_in", "damage")})
+    assert next(iter(search.run().posterior())) == leads
 
 
 def test_p_values_of_nothing_are_uniform(monkeypatch):
