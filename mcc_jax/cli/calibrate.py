@@ -157,7 +157,8 @@ def say_calibration(content: dict[str, Any], *, numbers: bool = True) -> None:
     from ..campaign import Finding
 
     used, law = sum(entry["kept"] for entry in content["particles"]), content["law"]
-    bad = {str(Finding.from_json(one)) for one in content["findings"] if one["level"] == "error"}
+    levels = {str(Finding.from_json(one)): one["level"] for one in content["findings"]}
+    bad = {text for text, level in levels.items() if level == "error"}
     state = "NOT converged." if not content["converged"] else "converged."
     if content["converged"] and bad:
         state = "the optimisers converged, but NOT TO BE TRUSTED: see below."
@@ -173,7 +174,8 @@ def say_calibration(content: dict[str, Any], *, numbers: bool = True) -> None:
             missed = f"{100 * misfit:.1f} % of their range (median over particles)"
             say(f"The mean law misses the displacements by {missed}.")
     for warning in sorted(content["warnings"], key=lambda text: text not in bad):
-        say(f"Warning: {sentence(warning)}", fg="red" if warning in bad else "yellow", bold=warning in bad)
+        label = "Note" if levels.get(warning) == "info" else "Warning"
+        say(f"{label}: {sentence(warning)}", fg="red" if warning in bad else "yellow", bold=warning in bad)
     for entry in content["particles"]:
         if not entry["kept"]:
             say(f"Not used: particle {entry['particle']}: {entry['why_not']}.", fg="yellow")
