@@ -246,8 +246,9 @@ def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
     best, other_best = (max(one.log_posteriors().values()) for one in (search, other))
     if other_best < best + STRONG:
         return None
-    gain = f"(log evidence larger by {other_best - best:.0f})"
-    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r} {gain}"
+    here, there = (f"{1e-3 * one.modulus_MPa:.2g} GPa" for one in (search, other))
+    gain = f"log evidence larger by {other_best - best:.0f}, effective modulus about {there}, not {here}"
+    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r} ({gain})"
     remedy = f"Calibrate in this form, Model(unloading={form.value!r}): the modulus belongs to it"
     found = Finding("form of unloading", "warning", text, remedy, code=FORM)
     other.untestable, other.left_out = search.untestable, [found, *search.left_out]

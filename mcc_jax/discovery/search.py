@@ -84,6 +84,12 @@ class Search:
         return next(names for names in self.log_posteriors() if names)
 
     @property
+    def modulus_MPa(self) -> float:
+        """The effective modulus under the most probable hypothesis, where that was linearised."""
+        at = self.found[next(iter(self.log_posteriors()))].at
+        return float(np.exp((self.null if at is None else at).state.population[1]))
+
+    @property
     def is_gap(self) -> bool:
         """Whether anything is missing."""
         return self.p_any < DECISIONS.level and self.posterior()[()] < 0.5
