@@ -208,6 +208,14 @@ def whitening(
     return replace(found, common=found((tests.force_zero_sd * linear.by_offset)[:, None])[:, 0])
 
 
+def correlations(tests: Tests, length: float, correlation: Correlation, along: Along) -> np.ndarray:
+    """Correlation of the residuals that are not white, between all points of every test."""
+    place = tests.path if along is Along.LOAD else tests.record.time
+    with standard_promotion():
+        kernel = KERNELS[correlation](scale=length, sigma=1.0)
+        return np.asarray(jax.vmap(lambda x: kernel(x, x))(jnp.asarray(place)))
+
+
 def _read_out(noise: Noise, tests: Tests, linear: Linear) -> Array:
     variance = noise.displacement**2 + (noise.force * linear.by_force) ** 2
     return variance if tests.reading_weight is None else variance / tests.reading_weight

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import with_sd
 from .._types import Progress
 from ..calibrate import Model, sample
 from ..calibrate.data import ranges_um, root_mean_squares
@@ -246,9 +247,13 @@ def _other_form(search: Search, assumed: Model, seed: int) -> Search | None:
     best, other_best = (max(one.log_posteriors().values()) for one in (search, other))
     if other_best < best + STRONG:
         return None
-    here, there = (f"{1e-3 * one.modulus_MPa:.2g} GPa" for one in (search, other))
-    gain = f"log evidence larger by {other_best - best:.0f}, effective modulus about {there}, not {here}"
-    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r} ({gain})"
+    text = f"The tests follow the law in its form of unloading {form.value!r}, not {asked.value!r} "
+    text += f"(log evidence larger by {other_best - best:.0f}"
+    moduli = [answer.parameters_with(one)["effective_modulus_MPa"] for one in (search, other)]
+    if not search.base.coarse and not any(map(is_unknown, moduli)):
+        here, there = (with_sd(one, 1e-3) for one in moduli)
+        text += f"; effective modulus {there} GPa, not {here} GPa"
+    text += ")"
     remedy = f"Calibrate in this form, Model(unloading={form.value!r}): the modulus belongs to it"
     found = Finding("form of unloading", "warning", text, remedy, code=FORM)
     other.untestable, other.left_out = search.untestable, [found, *search.left_out]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import betaln, expit, logsumexp
 
-from ..calibrate.noise import Along
+from ..calibrate.noise import correlations
 from ..calibrate.numpyro_model import Model
 from ..calibrate.priors import NakagamiPrior, SpreadCoordinate
 from ..effects import Variant
@@ -32,7 +32,6 @@ FOLLOWED = 4  # times at most that the prior of a misfit follows the amplitude o
 AGREE = 0.1  # difference of the logarithms of the two at which it need not
 DRIFTS = 6  # drifts of every test's own that are fitted at their own optimum
 MOST_STEPS = 12  # sudden ones of one test
-LENGTH = 3  # the place of the logarithm of the correlation's length among the hyperparameters
 
 
 @dataclass
@@ -264,16 +263,15 @@ class Step(NamedTuple):
 
 def sudden_steps(base: Base, start: Fitted, variant: Variant, *, of_noise: bool = False) -> RandomEffects | None:
     """Sudden steps in some tests, found one after the other, added to a fit; None without any. A test has one with a
-    probability that is itself unknown, uniformly, at any point of its loading. Those of the noise are of either sign,
-    at any point, and fade with its correlation: innovational outliers in place of level shifts (Chen and Liu 1993, J.
-    Am. Stat. Assoc. 88, 284)."""
+    probability that is itself unknown, uniformly, at any point of its loading. With `of_noise` they are outliers of the
+    noise: of either sign, at any point, and fading by its correlation (innovational outliers in place of level shifts:
+    Chen and Liu 1993, J. Am. Stat. Assoc. 88, 284); only their log evidence counts."""
     mask = np.asarray(base.tests.mask)
     response = np.where(mask[..., None], np.tril(np.ones((mask.shape[1], mask.shape[1]))), 0.0)
     allowed, sign = mask if of_noise else np.asarray(base.tests.loading) & mask, 0 if of_noise else 1
     if of_noise:
-        place = np.asarray(base.tests.path if base.model.along is Along.LOAD else base.tests.record.time)
-        away = np.maximum(place[:, :, None] - place[:, None], 0.0) / np.exp(start.optimum.hyper[LENGTH])
-        response *= np.exp(-away)
+        length = float(np.exp(start.optimum.hyper[3]))
+        response *= correlations(start.design.tests, length, start.design.correlation, start.design.along)
     low, high = variant.plausible
     unit, now, best, value = high / 3, start, None, -np.inf
     columns, found, steps = (), list[Step](), list[Step]()
@@ -308,7 +306,10 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant, *, of_noise: bool 
         value, now = with_prior, replace(start, design=design, optimum=optimum)
         best, steps = RandomEffects(variant, {}, value, now, ExtraColumns(columns, spreads)), list(found)
     if best is None or of_noise:
-        return best
+        # The spreads of the outliers are integrated out, as everything else is.
+        return best and replace(
+            best, log_evidence=optimise(best.at.design, best.at.optimum.hyper).log_evidence + best.of_choices
+        )
     at = fit_hypothesis(base, start.state, start.variants, start.theta, best.at.optimum.hyper, best.more)
     force, diameter, jumps = np.asarray(base.tests.force), np.asarray(base.tests.effective_diameter), []
     for step in steps:
@@ -317,16 +318,12 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant, *, of_noise: bool 
             stress = float(1e3 * force[i, step.point] / (np.pi * diameter[i] ** 2 / 4))
             probability = float(expit((size / step.sd) ** 2 / 2 - np.log(len(force[i]))))
             jumps.append(Jump(base.names[i], stress, size, step.sd, probability))
-    return (
-        replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=tuple(jumps))
-        if jumps or of_noise
-        else None
-    )
+    return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=tuple(jumps)) if jumps else None
 
 
 def step_scores(now: Fitted, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Score and information of a step of 1 um at every point, each particle's own numbers integrated out; `response`
-    has what a step (last axis) moves at every point."""
+    """Score and information of a step of 1 um at every point, each particle's own numbers integrated out;
+    `response[i, k, j]` is the displacement of test i at point k by a step at point j."""
     design = now.design
     residual = design.data - design.common @ now.solution.common - design.amplitude @ now.solution.amplitude
     alone = replace(design, data=residual, common=design.common[..., :0], group=design.group[:0])

@@ -17,7 +17,7 @@ from ..calibrate.running import side_by_side
 from ..campaign import Finding
 from ..effects import Variant
 from .base import Base, Library
-from .evidence import LinearModel, log_joint, with_little_noise
+from .evidence import LinearModel, log_joint, optimise, with_little_noise
 from .fit import Fitted, at_priors, fit_hypothesis, noise_models, with_likely_noise, with_other_noise
 from .hypothesis import Discrepancy, Hypothesis, Names, RandomEffects, fit_with_misfit, random_amplitude, sudden_steps
 from .misfit import coordinates, functions, general, informative, misfit_columns, scaled
@@ -64,6 +64,7 @@ class Search:
         self.fits: dict[tuple[int, ...], Fitted] = {}  # by the rows of the candidates in `screen`
         self.found: dict[Names, Hypothesis] = {(): Hypothesis((), self.null.log_evidence, at=self.null)}
         self.p_any = 1.0  # probability of so much evidence of anything by chance
+        self.outliers = 0.0  # log evidence that outliers of the noise add to every hypothesis
         self.untestable: list[dict[str, str]] = []  # mechanisms that these tests cannot show, and what they need
         self.left_out: list[Finding] = []  # which tests took no part, and why
 
@@ -82,12 +83,6 @@ class Search:
     def leader(self) -> Names:
         """The most probable hypothesis by which something is missing."""
         return next(names for names in self.log_posteriors() if names)
-
-    @property
-    def modulus_MPa(self) -> float:
-        """The effective modulus under the most probable hypothesis, where that was linearised."""
-        at = self.found[next(iter(self.log_posteriors()))].at
-        return float(np.exp((self.null if at is None else at).state.population[1]))
 
     @property
     def is_gap(self) -> bool:
@@ -111,13 +106,17 @@ class Search:
         logs = {names: one.log_evidence + priors[len(names)] for names, one in self.found.items()}
         if UNLISTED in logs:
             logs[UNLISTED] = self.found[UNLISTED].log_evidence - DECISIONS.unlisted
-        for names, one in self.found.items():
+        alone = {n: v for n, v in logs.items() if len(n) < 2 or self._credible(n, self.found[n].at)}
+        logs = dict(alone)
+        for names in alone:
+            one = self.found[names]
             if np.isfinite(one.with_discrepancy):
-                # A further cause, on no list: they count for the one that explains more by itself.
-                both = one.with_discrepancy + min(one.other_noise, 0.0) + priors[len(names)] - np.log(1 + len(names))
-                larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
-                logs[larger] = float(np.logaddexp(logs[larger], both - DECISIONS.pair - DECISIONS.unlisted))
-        return {n: v for n, v in logs.items() if len(n) < 2 or self._credible(n, self.found[n].at)}
+                # The names and a cause on no list: that counts for whichever explains more by itself.
+                both = one.with_discrepancy + min(one.other_noise, self.outliers) + priors[len(names)]
+                larger = names if alone[names] >= alone[UNLISTED] else UNLISTED
+                both -= np.log(1 + len(names)) + DECISIONS.pair + DECISIONS.unlisted
+                logs[larger] = float(np.logaddexp(logs[larger], both))
+        return logs
 
     def _credible(self, names: Names, r: Fitted | None) -> bool:
         """Whether the lesser name of a pair has a plausible amplitude; a larger one imitates what the other misses."""
@@ -231,10 +230,10 @@ class Search:
             pairs = self.fit_pairs({names: (first, k) for names, k in seconds.items()})
             tasks += [(pair_of(m, name), partial(self.of_their_own, m, at)) for m in self.not_shared]
         else:
-            pairs = []
+            pairs, start = [], (self.base, self.null.state)
+            side_by_side(self.fit, [(k,) for k in seconds.values()])
             for names, k in seconds.items():
-                start = self.base, self.null.state, *self.start_of([k]), self.small
-                tasks.append((names, partial(own.next_to, *start)))
+                tasks.append((names, partial(own.next_to, *start, *self.start_of([k]), self.small)))
                 # Numbers that were found without the second name have taken up some of its effect.
                 tasks.append((names, partial(self.of_their_own, name, self.fit((k,)))))
         for (names, _), one in zip(tasks, side_by_side(call, [task for _, task in tasks]), strict=True):
@@ -371,34 +370,38 @@ class Search:
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None:
                 self.pairs_with(first)
-            self.replace_names(first, {x.names for x in leading})
-            if max(x.with_discrepancy for x in leading) > max(x.log_evidence for x in self.found.values()):
-                for pair in self.pairs_better_than(first):  # where one name needs a discrepancy, two may need it, too
-                    self.fit_discrepancy(pair, most)
+            self.replace_names({x.names for x in leading})
+            best = max(x.log_evidence for x in self.found.values())
+            if max(x.with_discrepancy for x in leading) > best - DECISIONS.margin:
+                for pair in self.better_pairs():  # where one name needs a discrepancy, two may need it, too
+                    self.fit_discrepancy(pair, best)
         self.progress("other kinds of noise")
         self.other_noise()
 
-    def replace_names(self, first: Hypothesis, seen: set[Names]) -> None:
-        """The two best pairs by all formulas, and the best second names next to each name of the best pair, until
-        none is new (sequential replacement: Miller, Subset selection in regression, 2002, chapter 3): the name that
-        leads alone may imitate two others together. `seen` are the names whose second ones are known."""
-        while new := [pair for pair in self.pairs_better_than(first) if pair.names not in seen]:
-            for pair in new:
-                self.other_formulas(pair)
-                seen.add(pair.names)
-            best = self.pairs_better_than(first)[:1]
-            for m in [m for pair in best for m in pair.names if (m,) not in seen]:
+    def replace_names(self, seen: set[Names]) -> None:
+        """The two best pairs by all formulas; then each name of the best pair is kept in turn and the other replaced by
+        its best second names, until no name is new (sequential replacement: Miller, Subset selection in regression,
+        2002, chapter 3). The name that leads alone may imitate two others. `seen` are names that have been kept."""
+        for _ in range(SECONDS):
+            for pair in self.better_pairs():
+                if pair.names not in seen:
+                    self.other_formulas(pair)
+                    seen.add(pair.names)
+            new = [m for pair in self.better_pairs()[:1] for m in pair.names if (m,) not in seen]
+            if not new:
+                break
+            for m in new:
                 if self.found[m,].at is None:
                     self.fit_singles([m], FORMULAS)
                     self.fit_misfit(self.found[m,])
                 self.pairs_with(self.found[m,])
                 seen.add((m,))
 
-    def pairs_better_than(self, first: Hypothesis) -> list[Hypothesis]:
-        """The two best pairs of names whose numbers all tests share, if they explain more than one name does."""
+    def better_pairs(self) -> list[Hypothesis]:
+        """The two best pairs of names whose numbers all tests share, if they explain more than any name alone."""
+        one = max(x.log_evidence for names, x in self.found.items() if len(names) == 1 and names != UNLISTED)
         pairs = [x for x in self.found.values() if len(x.names) == 2 and x.at is not None and x.own is None]
-        better = [pair for pair in pairs if pair.log_evidence > first.log_evidence]
-        return sorted(better, key=lambda x: -x.log_evidence)[:2]
+        return sorted((x for x in pairs if x.log_evidence > one), key=lambda x: -x.log_evidence)[:2]
 
     def comes_near(self, leader: Names, log_evidence: float) -> bool:
         """Whether nothing, what leads to first order, or another search's leader begins near a log evidence, or may."""
@@ -423,13 +426,17 @@ class Search:
         if not leader:
             return
         kinds = noise_models(self.base)
-        steps = any(m in self.library and self.library[m].sudden for m in leader)
-        gains: dict[Names, list[float]] = {}
+        near = [names for names in list(logs)[:SECONDS] if logs[names] > logs[leader] - STRONG]
+        steps = any(self.library[m].sudden for names in near for m in names if m in self.library)
+        gains, outliers = dict[Names, list[float]](), list[float]()
 
         def work_out(names: Names) -> None:
             one = self.found[names]
-            if names not in gains and one.at is not None:
-                gains[names] = [*self._gains_by_noise(one, kinds), *([self._gain_by_outliers(one)] if steps else [])]
+            if names in gains or one.at is None:
+                return
+            if steps:
+                outliers.append(self._gain_by_outliers(one))
+            gains[names] = self._gains_by_noise(one, kinds) + outliers[-1:]
 
         work_out(())
         wanted = list(logs)[:SECONDS]
@@ -439,15 +446,24 @@ class Search:
             return
         for names in wanted:
             work_out(names)
+        # What was not worked out counts as if no other kind explained it better, and outliers the least they ever do.
+        self.outliers = max(min(outliers, default=0.0), 0.0)
+        others = [self.outliers] if outliers else []
+        if outliers and outliers[0] > STRONG:
+            text = (
+                f"The noise has outliers that fade (log evidence {outliers[0]:.0f}): not all that steps is a particle"
+            )
+            self.left_out = [*self.left_out, Finding("outliers of the noise", "info", text, "")]
         for names, one in self.found.items():
-            # What was not worked out counts as if no other kind explained it better.
-            one.other_noise = float(logsumexp([0.0, *gains.get(names, ())]) - np.log(1 + len(gains[()])))
+            one.other_noise = float(logsumexp([0.0, *gains.get(names, others)]) - np.log(1 + len(gains[()])))
 
     def _gain_by_outliers(self, one: Hypothesis) -> float:
-        """What a hypothesis gains where some readings' noise has outliers in addition, which fade."""
+        """What a hypothesis in its likelier form gains where the noise of some readings has outliers, which fade."""
         (sudden, *_) = (self.library[m].variants[0] for m in self.not_shared if self.library[m].sudden)
-        found = sudden_steps(self.base, one.fitted, sudden, of_noise=True)
-        return -np.inf if found is None else found.log_evidence - one.fitted.optimum.log_joint
+        hyper, design = one.likely_form()
+        start = replace(one.fitted, design=design, optimum=optimise(design, hyper))
+        found = sudden_steps(self.base, start, sudden, of_noise=True)
+        return -np.inf if found is None else found.log_evidence - start.log_evidence
 
     def _gains_by_noise(self, one: Hypothesis, models: Sequence[Model]) -> list[float]:
         """What a hypothesis in its likelier form gains under other kinds of noise; the best one is kept of a name."""

@@ -99,7 +99,7 @@ def _verdict(found: Discovery) -> str:
     if found.verdict == "NO_GAP":
         agree = f"The law and the {count} tests agree within the noise"
         if found.p_any < DECISIONS.level:
-            chance += "; noise of another kind, or with outliers, and nothing missing is more probable than any name"
+            chance += "; even so it is more probable that nothing is missing"
         return f"{agree}; as far as they can show, nothing is missing ({chance})."
     place = ""
     if found.where:

@@ -152,6 +152,43 @@ def test_a_second_name_has_an_amplitude_that_one_would_believe(named, with_pair)
         assert (pair in with_pair(pair, best + 100, at=formulas).posterior()) is (beyond == first)
 
 
+def test_names_that_a_leader_imitates_are_reached_by_replacing_it(named, monkeypatch):
+    """Frame compliance leads alone; its best pair is with creep, but creep with damage is better still."""
+    value = named.found["frame_compliance",].log_evidence
+    found = {(m,): Hypothesis((m,), value - lack, at=named.null) for m, lack in (("creep", 50), ("damage", 90))}
+    found |= {names: named.found[names] for names in ((), ("frame_compliance",), UNLISTED)}
+    by_name = {
+        "frame_compliance": {("creep", "frame_compliance"): value + 20},
+        "creep": {("creep", "damage"): value + 40, ("creep", "frame_compliance"): value + 20},
+        "damage": {("creep", "damage"): value + 40},
+    }
+    asked = []
+
+    def pairs_with(leader):
+        asked.append(leader.names[0])
+        for names, pair in by_name[leader.names[0]].items():
+            named.found.setdefault(names, Hypothesis(names, pair, pair, at=named.null))
+
+    monkeypatch.setattr(named, "found", found)
+    monkeypatch.setattr(named, "pairs_with", pairs_with)
+    monkeypatch.setattr(named, "other_formulas", lambda pair: None)
+    pairs_with(found["frame_compliance",])
+    named.replace_names({("frame_compliance",)})
+    assert named.better_pairs()[0].names == ("creep", "damage")
+    assert asked == ["frame_compliance", "creep", "damage"]
+
+
+def test_a_pair_with_a_discrepancy_counts_for_the_pair(named, monkeypatch):
+    pair, smooth = ("damage", "frame_compliance"), named.found[UNLISTED].log_evidence
+    logs = []
+    for both in (-np.inf, smooth + 200):
+        one = Hypothesis(pair, smooth + 50, smooth + 50, with_discrepancy=both)
+        monkeypatch.setattr(named, "found", {**named.found, pair: one})
+        logs.append(named._log_joints())
+    assert logs[1][pair] > logs[0][pair] + 50
+    assert all(logs[1][n] == logs[0][n] for n in logs[0] if n != pair)
+
+
 def test_a_name_with_a_discrepancy_counts_for_what_explains_more(named, monkeypatch):
     smooth = named.found[UNLISTED].log_evidence
     others = {n: replace(h, with_discrepancy=-np.inf) for n, h in named.found.items()}
