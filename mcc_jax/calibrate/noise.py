@@ -186,16 +186,20 @@ def forward_substitution(
     return jax.lax.scan(step, start, (diagonal, left, right, transition, values))[1]
 
 
+def places(tests: Tests, along: Along) -> Array:
+    """What the correlation of residuals is measured by: shares of the peak force passed [-], or time [s]."""
+    return tests.path if along is Along.LOAD else tests.record.time
+
+
 def whitening(
     noise: Noise, scale: Scalar, tests: Tests, linear: Linear, correlation: Correlation, along: Along
 ) -> Whitening:
     """The factored covariance of one test: tests and linear have no axis of particles, and the scale is this particle's
     in place of `noise.scale`."""
     variance = jnp.where(tests.mask, scale**2 * _read_out(noise, tests, linear), MASKED_UM2)
-    place = tests.path if along is Along.LOAD else tests.record.time
     with standard_promotion():
         kernel = KERNELS[correlation](scale=noise.length, sigma=scale * noise.correlated)
-        solver = QuasisepSolver(kernel, place, Diagonal(variance), assume_sorted=True)
+        solver = QuasisepSolver(kernel, places(tests, along), Diagonal(variance), assume_sorted=True)
     error = scale * noise.force * tests.peak_error
     if tests.peak_sd is not None:
         # A root has no slope at 0, and most peaks were read and not worked out.
@@ -210,10 +214,9 @@ def whitening(
 
 def correlations(tests: Tests, length: float, correlation: Correlation, along: Along) -> np.ndarray:
     """Correlation of the residuals that are not white, between all points of every test."""
-    place = tests.path if along is Along.LOAD else tests.record.time
     with standard_promotion():
         kernel = KERNELS[correlation](scale=length, sigma=1.0)
-        return np.asarray(jax.vmap(lambda x: kernel(x, x))(jnp.asarray(place)))
+        return np.asarray(jax.vmap(lambda x: kernel(x, x))(jnp.asarray(places(tests, along))))
 
 
 def _read_out(noise: Noise, tests: Tests, linear: Linear) -> Array:

@@ -102,6 +102,9 @@ def discover(
     if search.is_gap:
         search = _not_tared(campaign, search, begun, seed) or _other_form(search, assumed, seed) or search
     base, findings = search.base, (*findings, *search.left_out)
+    if search.outliers > STRONG:
+        text = f"The noise has outliers that fade (log evidence {search.outliers:.0f}): not every jump is a particle's"
+        findings = (*findings, Finding("outliers of the noise", "info", text, ""))
     ranking = answer.ranking_of(search)
     # By the law alone, under the model's own noise: those of a calibration.
     alone = answer.population_under(base, None, base.hyperparameters, design_of(base, base.state))

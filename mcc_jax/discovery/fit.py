@@ -15,7 +15,7 @@ from ..calibrate.data import ranges_um
 from ..calibrate.fitting import Start
 from ..calibrate.forward import Point
 from ..calibrate.judgement import LARGE_MISFIT
-from ..calibrate.noise import Along, Correlation, Noise, particle_scales
+from ..calibrate.noise import Along, Correlation, Noise, particle_scales, places
 from ..calibrate.numpyro_model import Model
 from ..calibrate.population import Population
 from .base import Base, State
@@ -186,7 +186,7 @@ def noise_models(base: Base) -> tuple[Model, ...]:
     mask = np.asarray(tests.mask)
 
     def length(along: Along) -> float:
-        x = tests.path if along is Along.LOAD else tests.record.time
+        x = places(tests, along)
         return max(float(np.median(np.where(mask, x, -np.inf).max(1) - np.where(mask, x, np.inf).min(1))), 1e-9)
 
     models = []

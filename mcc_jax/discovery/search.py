@@ -64,7 +64,7 @@ class Search:
         self.fits: dict[tuple[int, ...], Fitted] = {}  # by the rows of the candidates in `screen`
         self.found: dict[Names, Hypothesis] = {(): Hypothesis((), self.null.log_evidence, at=self.null)}
         self.p_any = 1.0  # probability of so much evidence of anything by chance
-        self.outliers = 0.0  # log evidence that outliers of the noise add to every hypothesis
+        self.outliers = 0.0  # log evidence that outliers of the noise add to every hypothesis, at least
         self.untestable: list[dict[str, str]] = []  # mechanisms that these tests cannot show, and what they need
         self.left_out: list[Finding] = []  # which tests took no part, and why
 
@@ -244,7 +244,8 @@ class Search:
     def without_name(self, pair: Names, own: RandomEffects | None) -> None:
         """Numbers of every test's own that were found next to a name, without it: the search for them may end early."""
         (mechanism,) = (m for m in pair if m in self.not_shared)
-        if own is not None and own.log_evidence > self.found[mechanism,].alone:
+        known = self.found[mechanism,]
+        if own is not None and own.log_evidence > known.alone and (known.own is None or known.own.more is not own.more):
             self.keep((mechanism,), own.next_to(self.base, self.null.state, (), (), self.small))
             self.fit_misfit(self.found[mechanism,])
 
@@ -428,15 +429,13 @@ class Search:
         kinds = noise_models(self.base)
         near = [names for names in list(logs)[:SECONDS] if logs[names] > logs[leader] - STRONG]
         steps = any(self.library[m].sudden for names in near for m in names if m in self.library)
-        gains, outliers = dict[Names, list[float]](), list[float]()
+        gains: dict[Names, list[float]] = {}
 
         def work_out(names: Names) -> None:
             one = self.found[names]
-            if names in gains or one.at is None:
-                return
-            if steps:
-                outliers.append(self._gain_by_outliers(one))
-            gains[names] = self._gains_by_noise(one, kinds) + outliers[-1:]
+            if names not in gains and one.at is not None:
+                by_outliers = [self._gain_by_outliers(one)] if steps else []
+                gains[names] = [*self._gains_by_noise(one, kinds), *by_outliers]
 
         work_out(())
         wanted = list(logs)[:SECONDS]
@@ -447,13 +446,8 @@ class Search:
         for names in wanted:
             work_out(names)
         # What was not worked out counts as if no other kind explained it better, and outliers the least they ever do.
-        self.outliers = max(min(outliers, default=0.0), 0.0)
-        others = [self.outliers] if outliers else []
-        if outliers and outliers[0] > STRONG:
-            text = (
-                f"The noise has outliers that fade (log evidence {outliers[0]:.0f}): not all that steps is a particle"
-            )
-            self.left_out = [*self.left_out, Finding("outliers of the noise", "info", text, "")]
+        self.outliers = max(min(gain[-1] for gain in gains.values()), 0.0) if steps else 0.0
+        others = [self.outliers] if steps else []
         for names, one in self.found.items():
             one.other_noise = float(logsumexp([0.0, *gains.get(names, others)]) - np.log(1 + len(gains[()])))
 

@@ -13,7 +13,7 @@ from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
 from mcc_jax.discovery.hypothesis import Hypothesis
 from mcc_jax.discovery.result import Effect
 from mcc_jax.discovery.search import Search
-from mcc_jax.discovery.settings import DECISIONS, UNLISTED, VERY_STRONG
+from mcc_jax.discovery.settings import DECISIONS, STRONG, UNLISTED, VERY_STRONG
 from mcc_jax.effects import LIBRARY, Need, find_variant
 
 pytestmark = pytest.mark.extended
@@ -78,7 +78,9 @@ def test_outliers_of_the_noise_fade_and_are_of_either_sign_while_steps_stay(hidd
         return curve.time_s, curve.force_mN, curve.displacement_um + size * fading
 
     search = search_in(with_curves(campaign, with_outlier), {name: LIBRARY[name] for name in ("pop_in", "damage")})
-    assert next(iter(search.run().posterior())) == leads
+    found = search.run()
+    assert next(iter(found.posterior())) == leads
+    assert (found.outliers > STRONG) is True
 
 
 def test_p_values_of_nothing_are_uniform(monkeypatch):
