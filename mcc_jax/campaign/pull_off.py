@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,8 @@ PULLED_OFF = Finding(
 )
 
 
-class PullOff(NamedTuple):
+@dataclass(frozen=True)
+class PullOff:
     r"""Tension at which a particle lets go of two platens, and the work of adhesion :math:`w` of either limit.
 
     .. math:: F = \tfrac32 \pi w R \ (\text{JKR}), \quad F = 2 \pi w R \ (\text{DMT}), \qquad
