@@ -24,7 +24,7 @@ from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD, Record
 from ..geometry import Particle
 from .base import Base
 from .design import Design, further_priors
-from .evidence import LinearModel, Solution, residual_of, whitened
+from .evidence import LinearModel, Solution, around, residual_of, whitened
 from .fit import Fitted, moved
 from .hypothesis import Names, RandomEffects
 from .result import Effect, Likeness, Place, Residuals
@@ -84,23 +84,41 @@ def averaged(each: Sequence[Estimates], weights: np.ndarray, particles: int) -> 
 
 
 def population_under(base: Base, formulas: Fitted | None, hyper: np.ndarray, design: Design) -> Estimates:
-    """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, which a
-    misfit widens (Brynjarsdottir and O'Hagan 2014), and the spreads of the coefficients."""
+    """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, and the
+    spreads of the coefficients.
+
+    A misfit widens the errors (Brynjarsdottir and O'Hagan 2014). They allow for those of the hyperparameters: by the
+    law of total variance, to second order around the mode (Kass and Steffey 1989, J. Am. Stat. Assoc. 84, 717).
+    """
     model = LinearModel(hyper, design)
-    solution, covariance, width = model.solve(), model.covariance(), design.common.shape[-1]
+    solution, width = model.solve(), design.common.shape[-1]
     mean, factor = base.population_prior
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
-    rows = np.zeros((POPULATION + 1, len(covariance)))
+    rows = np.zeros((POPULATION + 1, width + design.amplitude.shape[-1]))
     rows[:POPULATION, :POPULATION] = factor
-    rows[-1], at_peaks = rows[1], beta[1]
+    rows[-1], change = rows[1], 0.0
     if formulas is not None:
         change, slope = _modulus_at_peaks(base, formulas, solution)
-        names, at_peaks = len(formulas.variants), beta[1] + change
+        names = len(formulas.variants)
         rows[-1, width : width + names] += slope[:names]
         rows[-1, POPULATION : POPULATION + len(slope) - names] += slope[names:]
-    sd = np.sqrt(np.diagonal(rows @ covariance @ rows.T))
+
+    def given(model: LinearModel) -> tuple[np.ndarray, np.ndarray]:
+        """Means, but for what the hyperparameters do not change, and variances at given ones."""
+        found = model.solve()
+        means = rows @ np.append(found.common, found.amplitude)
+        return means, np.diagonal(rows @ model.covariance() @ rows.T)
+
+    _, least = given(model)
+    variance = least.copy()
+    for two in around(hyper, design):
+        (above, more), (below, less) = (given(LinearModel(at, design)) for at in two)
+        variance += ((above - below) / 2) ** 2 + (more + less) / 2 - least
+    sd = np.sqrt(np.maximum(variance, least))
+    # Where an effect on the modulus begins is its formula's: the modulus without it may be off by a share of it.
+    sd[1] = np.hypot(sd[1], DECISIONS.misfit_most * change)
     beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * base.flatness, -0.99)))
-    return np.append(beta, at_peaks), sd, model.scales[0][:3]
+    return np.append(beta, beta[1] + change), sd, model.scales[0][:3]
 
 
 def _modulus_at_peaks(base: Base, formulas: Fitted, solution: Solution) -> tuple[float, np.ndarray]:

@@ -357,12 +357,10 @@ class _Surface:
         value, at, slope = least
         return value, at, slope
 
-    def log_volume(self, x: np.ndarray, jac: np.ndarray, known: int) -> float:
-        """What Laplace's method adds for all but the first `known` hyperparameters at their mode, of slope `jac`."""
-        scale, first = self.scale, self.first
-        bound = x * scale >= self.most * scale - 1e-6
-        volume = -float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
-        wanted = np.flatnonzero(~bound)
+    def curvature(self, x: np.ndarray, jac: np.ndarray, known: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Eigenvalues and eigenvectors of the curvature at a mode of slope `jac`, by all but the first `known`
+        hyperparameters and those at their bound, and which ones these are."""
+        wanted = np.flatnonzero(~self.bound(x))
         wanted = wanted[wanted >= known]
         columns = np.zeros((len(wanted), len(wanted)))
         for row, j in enumerate(wanted.tolist()):
@@ -371,7 +369,17 @@ class _Surface:
         noise = int(np.sum(wanted < 4))
         columns[noise:, :noise] = columns[:noise, noise:].T
         values, vectors = np.linalg.eigh((columns + columns.T) / 2)
-        values = np.maximum(values, 1e-3)
+        return np.maximum(values, 1e-3), vectors, wanted
+
+    def bound(self, x: np.ndarray) -> np.ndarray:
+        """Which hyperparameters are as large as they may be."""
+        return x * self.scale >= self.most * self.scale - 1e-6
+
+    def log_volume(self, x: np.ndarray, jac: np.ndarray, known: int) -> float:
+        """What Laplace's method adds for all but the first `known` hyperparameters at their mode, of slope `jac`."""
+        scale, first, bound = self.scale, self.first, self.bound(x)
+        volume = -float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
+        values, vectors, wanted = self.curvature(x, jac, known)
         # A spread's coordinate is of either sign: close to zero, both are the same.
         of_spreads = (wanted >= 4) & (wanted < first)
         sd = np.sqrt(np.sum(vectors**2 / values, 1))
@@ -408,6 +416,17 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         evidence += surface.log_volume(x, jac, known)
         evidence += 0.0 if without is None else without.log_evidence - without.log_joint
     return Optimum(x * surface.scale, float(evidence), joint)
+
+
+def around(hyper: np.ndarray, design: Design) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Hyperparameters a standard deviation to either side of their mode, along each axis of their posterior."""
+    surface = _Surface(design)
+    x = hyper / surface.scale
+    values, vectors, wanted = surface.curvature(x, surface.at(x)[1])
+    steps = np.zeros((len(wanted), len(x)))
+    steps[:, wanted] = (vectors / np.sqrt(values)).T
+    either = [np.minimum(np.array([x + step, x - step]), surface.most) * surface.scale for step in steps]
+    return [(above, below) for above, below in either]
 
 
 def visible(hyper: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ FOLLOWED = 4  # times at most that the prior of a misfit follows the amplitude o
 AGREE = 0.1  # difference of the logarithms of the two at which it need not
 DRIFTS = 6  # drifts of every test's own that are fitted at their own optimum
 MOST_STEPS = 12  # sudden ones of one test
+LASTING = 0.05  # share of an outlier left at the end of its test from which on it is no different from a step
 
 
 @dataclass
@@ -264,14 +265,16 @@ class Step(NamedTuple):
 def sudden_steps(base: Base, start: Fitted, variant: Variant, *, of_noise: bool = False) -> RandomEffects | None:
     """Sudden steps in some tests, found one after the other, added to a fit; None without any. A test has one with a
     probability that is itself unknown, uniformly, at any point of its loading. With `of_noise` they are outliers of the
-    noise: of either sign, at any point, and fading by its correlation (innovational outliers in place of level shifts:
-    Chen and Liu 1993, J. Am. Stat. Assoc. 88, 284); only their log evidence counts."""
+    noise: of either sign, and fading by its correlation before the test ends (innovational outliers in place of level
+    shifts: Chen and Liu 1993, J. Am. Stat. Assoc. 88, 284); only their log evidence counts."""
     mask = np.asarray(base.tests.mask)
     response = np.where(mask[..., None], np.tril(np.ones((mask.shape[1], mask.shape[1]))), 0.0)
     allowed, sign = mask if of_noise else np.asarray(base.tests.loading) & mask, 0 if of_noise else 1
     if of_noise:
         length = float(np.exp(start.optimum.hyper[3]))
         response *= correlations(start.design.tests, length, start.design.correlation, start.design.along)
+        ends = mask.shape[1] - 1 - np.argmax(mask[:, ::-1], 1)
+        allowed = mask & (response[np.arange(len(mask)), ends] < LASTING)  # where noise lasts, it is the particle's
     low, high = variant.plausible
     unit, now, best, value = high / 3, start, None, -np.inf
     columns, found, steps = (), list[Step](), list[Step]()

@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 from campaigns import base_of, cached, with_curves
 from scipy.integrate import quad
+from scipy.special import softmax
 from scipy.stats import multivariate_normal, norm
 
 from mcc_jax import Model, sample
 from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.calibrate.priors import SCALES, nuisance_moments
+from mcc_jax.discovery.answer import population_under
 from mcc_jax.discovery.design import ExtraColumns, design_of
 from mcc_jax.discovery.evidence import (
     LinearModel,
     amplitudes,
+    around,
     log_joint,
     optimise,
     residual_of,
@@ -154,6 +157,27 @@ def test_it_prefers_a_model_as_much_as_importance_sampling_does(base):
     frame = fit_hypothesis(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.hyper)
     assert frame.theta[0] == pytest.approx(COMPLIANCE, rel=0.1)
     assert frame.log_evidence - nothing.log_evidence == pytest.approx(found[1] - found[0], rel=0.1)
+
+
+def test_errors_of_parameters_allow_for_those_of_the_hyperparameters(base, design):
+    """The law of total variance, by importance sampling of the hyperparameters."""
+    mode = optimise(design, base.hyperparameters)
+    _, sd, _ = population_under(base, None, mode.hyper, design)
+    axes = np.array([(above - below) / 2 for above, below in around(mode.hyper, design)])
+    normal = np.random.default_rng(0).standard_normal((600, len(axes)))
+    means, variances, logs = [], [], []
+    for z in normal:
+        model = LinearModel(mode.hyper + z @ axes, design)
+        factor = base.population_prior[1]
+        means.append(factor @ model.solve().common[:POPULATION])
+        variances.append(np.diagonal(factor @ model.covariance()[:POPULATION, :POPULATION] @ factor.T))
+        logs.append(log_joint(model.hyper, design) + z @ z / 2)
+    weights = softmax(logs)
+    assert 1 / np.sum(weights**2) > 60
+    total = weights @ np.array(variances) + weights @ np.array(means) ** 2 - (weights @ np.array(means)) ** 2
+    np.testing.assert_allclose(sd[:POPULATION], np.sqrt(total), rtol=0.1)
+    alone = np.diagonal(LinearModel(mode.hyper, design).covariance())[:POPULATION]
+    assert np.any(total > 1.02 * np.diagonal(factor @ np.diag(alone) @ factor.T))
 
 
 WANDER_UM, LENGTH_S = 0.3, 25.0

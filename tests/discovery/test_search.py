@@ -10,7 +10,7 @@ from mcc_jax.campaign import available_data
 from mcc_jax.discovery import answer, screen, verify
 from mcc_jax.discovery.answer import effects_of, instead_of, population_under, sets_of
 from mcc_jax.discovery.evidence import LinearModel, likely_start, optimise
-from mcc_jax.discovery.hypothesis import Hypothesis
+from mcc_jax.discovery.hypothesis import Hypothesis, sudden_steps
 from mcc_jax.discovery.result import Effect
 from mcc_jax.discovery.search import Search
 from mcc_jax.discovery.settings import DECISIONS, STRONG, UNLISTED, VERY_STRONG
@@ -81,6 +81,12 @@ def test_outliers_of_the_noise_fade_and_are_of_either_sign_while_steps_stay(hidd
     found = search.run()
     assert next(iter(found.posterior())) == leads
     assert (found.outliers > STRONG) is True
+    # Where noise is correlated over more than a test, nothing tells an outlier of it from a step of the particle.
+    (sudden, *_), null = LIBRARY["pop_in"].variants, search.null
+    assert sudden_steps(search.base, null, sudden, of_noise=True) is not None
+    hyper = null.optimum.hyper + np.log(1e3) * (np.arange(len(null.optimum.hyper)) == 3)
+    lasting = replace(null, optimum=replace(null.optimum, hyper=hyper))
+    assert sudden_steps(search.base, lasting, sudden, of_noise=True) is None
 
 
 def test_p_values_of_nothing_are_uniform(monkeypatch):
@@ -242,7 +248,9 @@ def test_formulas_of_the_modulus_agree_at_the_peaks():
     strain = [float(np.max(c.displacement_um)) for c in whole.curves] / np.asarray(search.base.tests.effective_diameter)
     errors = np.array([sd[5] for _, sd, _ in each])
     assert np.all(np.abs(at_peaks - np.log(16e3) - np.mean(strain)) < 3 * errors)
-    assert np.all(errors < [sd[1] for _, sd, _ in each])
+    wider = np.array([sd[1] for _, sd, _ in each])
+    assert np.all(errors < wider)
+    assert np.all(np.abs(extrapolated - np.log(16e3)) < 3 * wider)
 
 
 def test_pairs_to_first_order_are_of_two_mechanisms(named, monkeypatch):
